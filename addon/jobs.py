@@ -133,6 +133,9 @@ class JobState(bpy.types.PropertyGroup):
     """What the panel shows of the running job. Read-only: setting a property would redraw the whole window, including the 3-D view."""
 
     running: bpy.props.BoolProperty(name="Running", get=lambda _: _watched() is not None)  # type: ignore[valid-type]
+    blocks: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Blocks", get=lambda _: _watched() is not None and not get_session().job_operator.gives_way
+    )
     progress: bpy.props.FloatProperty(
         name="Progress",
         min=0.0,
@@ -182,6 +185,8 @@ class JobOperator:
     step: ClassVar[str] = ""  # of the panel, with which the job begins
     steps: ClassVar[Mapping[str, str]] = MappingProxyType({})  # of the panel, by the monitor's task
     if_stopped: ClassVar[str] = ""  # a sentence for those who stop it
+    gives_way: ClassVar[bool] = False  # it is stopped when another job is begun
+    gave_way = False
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
         """Main thread: read everything from Blender and return the computation."""
@@ -202,6 +207,10 @@ class JobOperator:
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Modal driver: start the thread and watch it."""
         session = get_session()
+        if session.job is not None and session.job_operator is not None and session.job_operator.gives_way:
+            session.job_operator.gave_way = True
+            stop_current()
+            stop_watching()
         if session.job is not None:
             self.report({"ERROR"}, "Another Tricap job is running. Wait for it, or press Esc.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
@@ -218,6 +227,8 @@ class JobOperator:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show the progress; Esc cancels, and the window stays responsive until the thread has stopped."""
+        if self.gave_way:
+            return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS":
             self.job.monitor.cancel()
         elif event.type != "TIMER":

@@ -29,6 +29,7 @@ class _Action:
 
     index: int
     before: list[tuple[int, str, str, list[float] | None]] = field(default_factory=list)
+    skipped: str = ""  # the joint that it skipped
 
 
 class ClickSession:
@@ -54,6 +55,7 @@ class ClickSession:
         self.proposals: dict[str, Proposal] = {}
         self.asking, self.problem = False, ""
         self._history: list[_Action] = []
+        self._skipped: set[str] = set()
         self._proposed_for: dict[str, np.ndarray] = {}
         self.go_to_next(from_index=0)
 
@@ -114,19 +116,26 @@ class ClickSession:
         if self.name and self.proposals:
             self._put({view: offer.xy_px for view, offer in self.proposals.items()})
         elif self.name:
-            self.skip()
+            self._leave(on_purpose=False)
 
     def skip(self) -> None:
-        """Leave the current joint as it is and go to the next."""
+        """Leave the current joint as it is and go to the next; it is not asked for again."""
         if self.name:
-            self._history.append(_Action(index=self.index))
-            self.go_to_next(self.index + 1)
+            self._leave(on_purpose=True)
+
+    def _leave(self, *, on_purpose: bool) -> None:
+        new = self.name if on_purpose and self.name not in self._skipped else ""
+        self._history.append(_Action(index=self.index, skipped=new))
+        if new:
+            self._skipped.add(new)
+        self.go_to_next(self.index + 1)
 
     def back(self) -> bool:
         """Undo the last action, or without one go to the previous joint. False if there is none."""
         if self._history:
             action = self._history.pop()
             self.index = action.index
+            self._skipped.discard(action.skipped)
             for frame, name, view, xy in reversed(action.before):
                 if xy is None:
                     clicks.remove_click(self.clips[view], name, frame)
@@ -145,16 +154,28 @@ class ClickSession:
         self.propose()
 
     def go_to_next(self, from_index: int) -> None:
-        """Make the first joint from this index on that is not clicked in two views the current one."""
+        """Make the first joint from this index on that is not clicked in two views the current one; after the last, the first that is
+        missing. All are done when each is clicked in two views or was skipped."""
         self.index = from_index
-        while self.name and len(self.clicks()) >= min(2, len(self.views)):
+        while self.name and self._is_complete(self.name):
             self.index += 1
+        if not self.name and not self.endless:
+            self.index = next((i for i, name in enumerate(self.names) if name in self.missing()), len(self.names))
         self.propose()
+
+    def _is_complete(self, name: str) -> bool:
+        return len(self.clicks(name)) >= min(2, len(self.views))
+
+    def missing(self, *, skipped: bool = False) -> dict[str, int]:
+        """The joints that are not clicked in two views, with the number of views in which they are; with `skipped` also those skipped."""
+        left = [name for name in self.names if not self._is_complete(name) and (skipped or name not in self._skipped)]
+        return {name: len(self.clicks(name)) for name in left}
 
     def show_frame(self, frame: int) -> None:
         """Click in another frame from now on."""
         if frame != self.frame:
             self.frame = frame
+            self._skipped.clear()
             self.go_to_next(0)
 
     def propose(self) -> None:

@@ -159,10 +159,17 @@ class ClickOperator:
         session = self.session
         if not session.changed or not session.has_all_clips:
             return {"FINISHED" if session.changed else "CANCELLED"}
-        done = sum(len(session.clicks(name)) > 1 for name in session.names)
+        done = len(session.names) - len(session.missing(skipped=True))
         result = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two or more views."
-        self.report({"INFO"}, f"{result} Press Back to Steps, above the first view.")  # type: ignore[attr-defined]
+        self.report({"INFO"}, f"{result}{_what_is_missing(session)} Press Back to Steps, above the first view.")  # type: ignore[attr-defined]
         return {"FINISHED"}
+
+
+def _what_is_missing(session: ClickSession) -> str:
+    """A sentence about the joints that are not clicked in two views, "" if all are."""
+    missing = {} if session.endless else session.missing(skipped=True)
+    named = [name if not count else f"{name} (one view only)" for name, count in missing.items()]
+    return f" Missing: {', '.join(named)}." if named else ""
 
 
 class ClickJoints(ClickOperator, bpy.types.Operator):

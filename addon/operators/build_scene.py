@@ -1,7 +1,8 @@
 """bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity", …)"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -112,21 +113,39 @@ def put_into_scene(
     options: SceneOptions = DEFAULTS,
 ) -> None:
     """Build the scene and report its contents; the first time, frame the body in the 3-D views."""
-    first = scene_build.COLLECTION not in bpy.data.collections
+    first = armature.NAME not in bpy.data.objects
     report_scene(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
     chosen = context.scene.tricap_retarget
     if body is not None:
         chosen.source, chosen.export = chosen.source or body, chosen.export or body
-    if first and body is not None and context.window is not None and not bpy.app.background:
-        _hide_default_objects(operator, context)
-        for item in context.selected_objects:
-            item.select_set(False)
-        body.select_set(True)
-        for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
-            region = next(r for r in area.regions if r.type == "WINDOW")
-            with context.temp_override(area=area, region=region):
-                bpy.ops.view3d.view_selected()
+    if first and body is not None:
+        _frame(operator, context, [body])
+
+
+def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
+    """Show the results that there are: cameras, then the cloud, then trajectories. A scene with a body stays as it is, with its edits."""
+    if any(thing.type == "ARMATURE" for built in scene_build.built_collections(context.scene) for thing in built.all_objects):
+        return
+    first = not scene_build.built_collections(context.scene)
+    write_scene(replace(contents, warnings=(), shape=None, motion=None))
+    if first:
+        _frame(operator, context, [thing for built in scene_build.built_collections(context.scene) for thing in built.all_objects])
+
+
+def _frame(operator: bpy.types.Operator, context: bpy.types.Context, things: Sequence[bpy.types.Object]) -> None:
+    """Frame these objects in the 3-D views, without the objects of Blender's startup file."""
+    if context.window is None or bpy.app.background:
+        return
+    _hide_default_objects(operator, context)
+    for item in context.selected_objects:
+        item.select_set(False)
+    for thing in things:
+        thing.select_set(True)
+    for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
+        region = next(r for r in area.regions if r.type == "WINDOW")
+        with context.temp_override(area=area, region=region):
+            bpy.ops.view3d.view_selected()
 
 
 def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:

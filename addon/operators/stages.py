@@ -14,7 +14,8 @@ from ...core.run.engine import of_this_machine
 from ...core.run.phases import course_of
 from .. import project
 from ..jobs import JobOperator
-from .build_scene import RELATIVE
+from ..scene.contents import Contents, read_contents
+from .build_scene import RELATIVE, show_so_far
 
 STEP_OF_TASK = MappingProxyType({"measure": "surface", "track": "tracks", "fit": "body", "report": "body", "build": "rig"})
 
@@ -25,15 +26,27 @@ class StageOperator(JobOperator):
     stages: ClassVar[tuple[str, ...]] = ()
     steps = STEP_OF_TASK
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], take_run.Run]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[take_run.Run, Contents | None]]:
         """Folders and settings as they are now; writes the project's take.toml."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
-        return lambda monitor: run_stages(take, out, overrides, self.stages, monitor)
+        stages, shown = self.stages, project.bound(context.scene) and not self.out  # type: ignore[attr-defined]
+        return lambda monitor: run_and_read(take, out, overrides, stages, shown, monitor)
 
-    def finish(self, context: bpy.types.Context, result: take_run.Run) -> set[str]:
-        """Report the run."""
-        report_run(self, context, result)
+    def finish(self, context: bpy.types.Context, result: tuple[take_run.Run, Contents | None]) -> set[str]:
+        """Show what was measured in the viewport, and report the run."""
+        run, contents = result
+        if contents is not None:
+            show_so_far(self, context, contents)
+        report_run(self, context, run)
         return {"FINISHED"}
+
+
+def run_and_read(
+    take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], shown: bool, monitor: Monitor
+) -> tuple[take_run.Run, Contents | None]:
+    """The computation, without bpy: the stages, and if they are `shown`, what they measured."""
+    run = run_stages(take, out, overrides, names, monitor)
+    return run, read_contents(out, monitor) if shown and "fit" not in names else None
 
 
 def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> None:

@@ -148,13 +148,18 @@ def _places(contents: Contents, folder: Path) -> dict[str, str]:
     return places
 
 
+def built_collections(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The collections of earlier builds in a scene."""
+    return [child for child in scene.collection.children_recursive if OUT_KEY in child]
+
+
 def remove_earlier() -> list[str]:
     """Remove the collections of earlier builds from this scene, with their objects, their control rigs and the data that nothing else uses.
 
     Returns a sentence for each control rig that was removed.
     """
     scene, removed = bpy.context.scene, []
-    for collection in [child for child in scene.collection.children_recursive if OUT_KEY in child]:
+    for collection in built_collections(scene):
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
         for rig in [o[armature.RIG_KEY] for o in objects if o.get(armature.RIG_KEY) is not None]:
             removed.append(f"The control rig “{rig.name}” was removed with the earlier body{_keep_corrections(rig)}.")

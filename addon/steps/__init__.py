@@ -11,20 +11,22 @@ def _classes() -> tuple[type, ...]:
 
 def register() -> None:
     """Register the operators and the panel, and keep the states up to date."""
-    from . import watch
+    from . import check, watch
 
     for cls in _classes():
         bpy.utils.register_class(cls)
     watch.register()
+    check.begin()
 
 
 def unregister() -> None:
     """Take everything away again, in reverse order."""
     from .. import jobs
-    from . import watch
+    from . import check, watch
 
     jobs.stop_current()
     jobs.stop_watching()
+    check.end()
     watch.unregister()
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)

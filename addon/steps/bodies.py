@@ -105,13 +105,14 @@ def cameras(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     primary(column, "tricap.cameras_from_file", is_next, icon="FILE_CACHE")
     column.operator("tricap.cameras_from_scene", icon="OUTLINER_OB_CAMERA")
     now, props = watch.current(context.scene), context.scene.tricap
+    if now.states["cameras"].fix == Fix.MATCH_NAMES:
+        primary(column, "tricap.match_names", True, icon="SORTALPHA")
     if now.states["cameras"].status == Status.DONE:
         column.operator("tricap.check", icon="VIEWZOOM")
         if props.check_said and props.check_key == now.keys.get("measure"):
             for line in props.check_said.splitlines():
                 sentence(column.box(), context, line, "CHECKMARK" if props.check_passed else "INFO")
-            if check.SetOffsets.poll(context):
-                column.operator("tricap.mend_offsets", icon="TIME")
+            check.draw_mends(column, context)
 
 
 def clicked_views(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
@@ -142,7 +143,11 @@ def _clicks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
         clicked = clicked_views(context)
     except InputError:
         return  # the step's message has the reason
-    column = layout.column(align=True)
+    header, inside = layout.panel("tricap_joints", default_closed=True)
+    header.label(text=f"Joints ({sum(len(views) > 1 for _, views in clicked)} of {len(clicked)} clicked)")
+    if inside is None:
+        return
+    column = inside.column(align=True)
     column.scale_y = 0.8
     for name, views in clicked:
         row = column.row()
@@ -235,7 +240,7 @@ def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, 
     header, inside = layout.panel(f"tricap_{name}", default_closed=closed)
     header.label(text=title)
     if inside is not None:
-        inside.enabled = not context.window_manager.tricap.running
+        inside.enabled = not context.window_manager.tricap.blocks
         inside.use_property_split, inside.use_property_decorate = True, False
         draw(inside, context)
 

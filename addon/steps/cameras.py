@@ -7,11 +7,15 @@ import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
 from ...core.calibration.rig_files import read_any
-from ...core.geometry.rig import Rig, write_rig
+from ...core.calibration.view_names import names_for_views
+from ...core.geometry.rig import Rig, renamed, write_rig
 from ...core.take.bar_file import bar_path, read_bar, write_bar
+from ...core.take.footage import open_take
 from .. import folders, project
 from ..calibrate.cameras import rig_of_scene
+from ..operators.build_scene import show_so_far
 from ..scene import clips
+from ..scene.contents import Contents
 from .footage import SimpleOperator
 
 
@@ -26,8 +30,13 @@ class CamerasFromFile(SimpleOperator, ImportHelper, bpy.types.Operator):
         """Read it and save a copy as rig.toml in the project."""
         path = folders.absolute(self.filepath)
         rig = read_any(path)
-        use_rig(context.scene, rig, read_bar(path, rig))
-        return f"{len(rig.cameras)} cameras from {Path(self.filepath).name}. Press Check (step 2) to see whether they fit the footage."
+        bar, names = read_bar(path, rig), names_for_views(rig, [view.name for view in context.scene.tricap.views])
+        use_rig(context.scene, renamed(rig, names), bar)
+        show_cameras(self, context)
+        matched = "".join(f" Camera {camera} is view {view}." for camera, view in names.items())
+        return (
+            f"{len(rig.cameras)} cameras from {Path(self.filepath).name}.{matched}{' Correct the names if that is wrong.' if names else ''}"
+        )
 
 
 class CamerasFromScene(SimpleOperator, bpy.types.Operator):
@@ -42,6 +51,13 @@ class CamerasFromScene(SimpleOperator, bpy.types.Operator):
         rig = rig_of_scene(context.scene)
         use_rig(context.scene, rig)
         return f"{len(rig.cameras)} cameras from the scene."
+
+
+def show_cameras(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Put the project's cameras with their footage into the viewport, unless a body is there."""
+    footage = open_take(project.take(context.scene))
+    contents = Contents(out=folders.output_folder("", context.scene), run={"take": str(footage.take.folder)}, footage=footage)
+    show_so_far(operator, context, contents)
 
 
 def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray] | None = None) -> None:

@@ -1,20 +1,30 @@
-"""bpy.ops.tricap.check(), bpy.ops.tricap.mend_offsets()"""
+"""bpy.ops.tricap.check(), .mend_offsets(), .match_names(), .set_fields()
+
+In the window, the check begins by itself when footage and cameras are there and nothing else runs; it gives way to any other job.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 
-from ...core.checking.findings import Checked
+from ...core.calibration.view_names import names_for_views
+from ...core.checking.findings import Cause, Checked
+from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
+from ...core.geometry.rig import read_rig, renamed
+from ...core.images.interlace import BOTH
 from ...core.run.check import check_take
+from ...core.take.bar_file import read_bar
 from .. import project
 from ..jobs import JobOperator
 from ..session import get_session
-from . import watch
+from . import states, watch
+from .cameras import use_rig
 from .footage import SimpleOperator
 
 GOOD = "No problems found."
+LOOK_S = 2.0  # between two looks whether a check should begin by itself
 
 
 class Check(JobOperator, bpy.types.Operator):
@@ -24,6 +34,7 @@ class Check(JobOperator, bpy.types.Operator):
     bl_label = "Check Footage, Cameras and Sync"
     step = "cameras"
     if_stopped = "Nothing was changed."
+    gives_way = True
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Checked]:
         """The project with the scene's current values."""
@@ -38,7 +49,11 @@ class Check(JobOperator, bpy.types.Operator):
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
         offsets = result.figures.get("offsets", {})
         late = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
-        get_session().file.late_frames[props.check_key] = late
+        file = get_session().file
+        file.late_frames[props.check_key] = late
+        by_cause = {finding.cause: finding.figures for finding in result.findings}
+        file.camera_of[props.check_key] = dict(by_cause.get(Cause.SWAPPED_VIEWS, {}).get("camera_of", {}))
+        file.fields_found[props.check_key] = str(by_cause[Cause.COMBING]["first_field"] or "odd") if Cause.COMBING in by_cause else ""
         for line in props.check_said.splitlines():
             self.report({"INFO" if props.check_passed else "WARNING"}, line)
         return {"FINISHED"}
@@ -64,4 +79,94 @@ class SetOffsets(SimpleOperator, bpy.types.Operator):
         return "Offsets: " + ", ".join(f"{view.name} {view.offset_frames}" for view in context.scene.tricap.views)
 
 
-CLASSES = (Check, SetOffsets)
+class MatchNames(SimpleOperator, bpy.types.Operator):
+    """Give the cameras the names of the views that they fit: as the check found, or as their names or their order say"""
+
+    bl_idname = "tricap.match_names"
+    bl_label = "Match Names"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only after a check in this session that found swapped views, or where a view has no camera."""
+        now = get_session().file.step_states.get(context.scene.name_full)
+        unnamed = now is not None and now.states["cameras"].fix == states.Fix.MATCH_NAMES
+        return unnamed or bool(get_session().file.camera_of.get(context.scene.tricap.check_key))
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Rename the cameras in rig.toml; the bar stays with them."""
+        path = project.take(context.scene).rig_path
+        rig = read_rig(path)
+        names = names_for_views(rig, [view.name for view in context.scene.tricap.views])
+        camera_of = get_session().file.camera_of.get(context.scene.tricap.check_key, {})
+        names = names or {camera: view for view, camera in camera_of.items() if view != camera}
+        use_rig(context.scene, renamed(rig, names), read_bar(path, rig))
+        return "Cameras: " + ", ".join(f"{camera} is {view} now" for camera, view in names.items()) + "."
+
+
+class SetFields(SimpleOperator, bpy.types.Operator):
+    """Measure both fields of the interlaced footage as frames, in the order that the check found"""
+
+    bl_idname = "tricap.set_fields"
+    bl_label = "Set Field Order"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only after a check in this session that found combing."""
+        return bool(get_session().file.fields_found.get(context.scene.tricap.check_key))
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Set them, and show the fields."""
+        props = context.scene.tricap
+        first = get_session().file.fields_found[props.check_key]
+        before = props.interlaced, props.first_field
+        props.interlaced, props.first_field = BOTH, first
+        try:
+            project.show_fields(context.scene)
+        except InputError:
+            props.interlaced, props.first_field = before
+            raise
+        return f"Both fields are measured, the {'upper' if first == 'odd' else 'lower'} one first: every field is a frame now."
+
+
+def draw_mends(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Buttons that mend what the check found."""
+    for mend, icon in ((SetFields, "RENDERLAYERS"), (MatchNames, "SORTALPHA"), (SetOffsets, "TIME")):
+        if mend.poll(context):
+            layout.operator(mend.bl_idname, icon=icon)
+
+
+def should_begin(scene: bpy.types.Scene) -> bool:
+    """Whether the check should begin by itself: with new footage or cameras, before the surface is measured, while nothing runs."""
+    session, now = get_session(), get_session().file.step_states.get(scene.name_full)
+    if now is None or session.job is not None or session.click_operator is not None or session.file.changed:
+        return False
+    key = now.keys.get("measure", "")
+    if not key or key in session.file.checked_keys or key == scene.tricap.check_key:
+        return False
+    done, unmeasured = states.Status.DONE, (states.Status.READY, states.Status.EMPTY)
+    return now.states["footage"].status == now.states["cameras"].status == done and now.states["surface"].status in unmeasured
+
+
+def _look() -> float:
+    context = bpy.context
+    scene, window = context.scene, next(iter(context.window_manager.windows), None)
+    if scene is not None and window is not None and not bpy.app.background and should_begin(scene):
+        get_session().file.checked_keys.add(watch.current(scene).keys["measure"])
+        with context.temp_override(window=window):
+            bpy.ops.tricap.check("INVOKE_DEFAULT")
+    return LOOK_S
+
+
+def begin() -> None:
+    """Begin to look whether a check should begin."""
+    bpy.app.timers.register(_look, first_interval=LOOK_S, persistent=True)
+
+
+def end() -> None:
+    """Stop looking."""
+    bpy.app.timers.unregister(_look)
+
+
+CLASSES = (Check, SetOffsets, MatchNames, SetFields)

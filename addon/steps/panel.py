@@ -44,7 +44,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         layout, job = self.layout, context.window_manager.tricap
         if job.running:
             draw_job(layout, context)
-        else:
+        if not job.blocks:
             draw_next(layout, context)
         for step in STEPS:
             self.draw_step(context, step)
@@ -63,7 +63,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         column = body.column()
         if state.message and state.status != Status.RUNNING:
             draw_message(column, context, state)
-        column.enabled = not context.window_manager.tricap.running
+        column.enabled = not context.window_manager.tricap.blocks
         column.use_property_split, column.use_property_decorate = True, False
         bodies.DRAW[step](column, context, step == now.next)
         bodies.advanced(body, context, step)

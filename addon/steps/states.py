@@ -57,6 +57,7 @@ class Fix(Enum):
     FIND_FOOTAGE = "find footage"
     CHOOSE_TAKE = "choose take"  # the one on disk or the scene's
     COMMON_FRAMES = "common frames"
+    MATCH_NAMES = "match names"
 
 
 class FixableError(InputError):
@@ -175,6 +176,12 @@ def _cameras(scene: bpy.types.Scene, found: _Project) -> State:
     if not path.exists():
         return State(status=Status.READY, message="Import a calibration file, or calibrate with a wand or board.")
     rig = read_rig(path)
+    names = [camera.name for camera in rig.cameras]
+    if lost := [view.name for view in scene.tricap.views if view.name not in names]:
+        message = (
+            f"No camera is called {' or '.join(lost)}; the calibration has {', '.join(names)}. Press Match Names, or rename the views."
+        )
+        raise FixableError(message, Fix.MATCH_NAMES)
     for view in scene.tricap.views:
         size = rig[view.name].size_px
         if tuple(view.clip.size) != size:
@@ -283,12 +290,13 @@ def _figures(step: str, entry: Mapping[str, Any]) -> str:
 
 def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -> State:
     built = next((c for c in scene.collection.children_recursive if OUT_KEY in c), None)
-    if built is None:
-        last = "tracks" if found.take is not None and found.take.body_model is None else "body"
+    last = "tracks" if found.take is not None and found.take.body_model is None else "body"
+    so_far = built is not None and STAGE[last] not in dict(built.get(KEYS_KEY, {})) and not _has_armature(built)
+    if built is None or (so_far and found.take is not None and states[last].status != Status.STALE):
         if states[last].status != Status.DONE:
             return State(status=Status.EMPTY, message=f"Finish step {STEPS.index(last) + 1} first.")
         return State(status=Status.READY, message="Build armature, skin and cameras in this scene.")
-    moving = any(o.type == "ARMATURE" for o in built.all_objects)
+    moving = _has_armature(built)
     if states["body"].status == Status.DONE and not moving:
         return State(status=Status.STALE, message="The body's armature is missing from the scene. Build it again.")
     now = found.keys or {}
@@ -297,6 +305,10 @@ def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -
     if found.keys is not None and lacks_results(built, found):
         return State(status=Status.STALE, message="There are results that the scene does not show yet. Build it again.")
     return State(status=Status.DONE, message="The armature plays the motion." if moving else "Surface and tracks are in the scene.")
+
+
+def _has_armature(built: bpy.types.Collection) -> bool:
+    return any(thing.type == "ARMATURE" for thing in built.all_objects)
 
 
 def lacks_results(built: bpy.types.Collection, found: _Project) -> bool:

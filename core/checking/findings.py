@@ -11,6 +11,7 @@ class Cause(StrEnum):
 
     BLANK_VIEW = "blank view"
     CLICKS = "clicks"
+    COMBING = "combing"
     COVERAGE = "coverage"
     DARK = "dark"
     FEW_CLICKS = "few clicks"

@@ -229,7 +229,7 @@ def rig_findings(
                 f"The views {swapped} are swapped: {pairing} ({100 * best:.0f} % of {len(distances)} "
                 f"matches agree, {100 * agreeing:.0f} % in the present order).",
                 "Swap their footage in take.toml, or the names of the cameras in rig.toml.",
-                **(figures | {"agreeing_swapped_share": best}),
+                **(figures | {"agreeing_swapped_share": best, "camera_of": {names[k]: cameras[order[k]].name for k in range(len(names))}}),
             )
         ]
     of_pairs = [c for c in clicks if len(c.xi_px) and (c.i, c.j) in {(p.i, p.j) for p in usable}]

@@ -22,6 +22,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..geometry.robust import finite_median
+from ..images.combing import Combing, combing
 from ..images.sampling import noise_sigma
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
@@ -43,7 +44,7 @@ from .rig_check import (
 )
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .timing import Film, TimeOffset, estimate_offsets
-from .view_matches import match_views
+from .view_matches import eight_bits, match_views
 
 FAR_M = 1.0  # in depth: more than the reach of a stretched-out arm
 
@@ -211,6 +212,7 @@ STEP_RATIO = 2.0  # of the medians before and after it; in sound takes those of 
 STEP_PX = 0.05  # between these medians
 SMALL = 0.05  # frames: not worth an interpolation
 SPOILS = 0.25  # frames: a larger offset spoils a measurement
+COMBED_FRAMES = 4  # in which combing is looked for
 UNUSABLE = (  # footage with which time offsets cannot be estimated
     Cause.BLANK_VIEW,
     Cause.FROZEN_VIEW,
@@ -249,7 +251,8 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     identical = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
     findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
-    findings += [*weak, *seed_findings(footage)]
+    combed = film_combing(film) if footage.take.interlaced == "none" else None
+    findings += [*combing_findings(combed), *weak, *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},
@@ -267,6 +270,29 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         findings += stale_finding(distance | {o.view: o.distance_px for o in offsets if math.isfinite(o.distance_px)})
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return findings, figures
+
+
+def film_combing(film: Film) -> Combing:
+    """The combing of the images in which most moves, all views together."""
+    views = film.footage.sequences
+    numbers = [(k, film.footage.number(k, t)) for t in film.frames()[:COMBED_FRAMES] for k in range(len(views)) if film.has(k, t + 1)]
+    return combing([(eight_bits(views[k].read(n)), eight_bits(views[k].read(n + 1))) for k, n in numbers])
+
+
+def combing_findings(combed: Combing | None) -> list[Finding]:
+    """Interlaced footage that is measured as progressive."""
+    if combed is None or not combed.found:
+        return []
+    return [
+        wrong(
+            Cause.COMBING,
+            f"Combing was found where something moves ({combed.ratio:.1f} times as much between neighbouring rows as between rows of one "
+            "field): the footage is interlaced.",
+            'Set `interlaced = "both"` in take.toml' + (f' and `first_field = "{combed.first}"`.' if combed.first else "."),
+            ratio=combed.ratio,
+            first_field=combed.first,
+        )
+    ]
 
 
 def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:

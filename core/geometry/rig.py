@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,12 @@ class Rig:
             f"The rig has no camera “{name}”.{nearest_name(name, [c.name for c in self.cameras])}"
             " Give the views in take.toml the names of the cameras in rig.toml."
         )
+
+
+def renamed(rig: Rig, names: Mapping[str, str]) -> Rig:
+    """The rig with other names for its cameras; `names`: the new ones by the old ones, where they change."""
+    cameras = tuple(replace(camera, name=names.get(camera.name, camera.name)) for camera in rig.cameras)
+    return replace(rig, cameras=cameras, sigmas={names.get(name, name): sigmas for name, sigmas in rig.sigmas.items()})
 
 
 def read_rig(path: Path) -> Rig:

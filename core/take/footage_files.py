@@ -51,7 +51,7 @@ def find_footage(folder: Path, names: Sequence[str]) -> list[Path]:
 
 def name_views(sources: Sequence[Path], taken: Sequence[str] = ()) -> list[tuple[str, Path]]:
     """Names for footage, in the order of the cameras: L, C, R if the file names contain the side, else the parts in which they differ."""
-    sides = [_side(path.stem if path.is_file() else path.name) for path in sources]
+    sides = [side_of_name(path.stem if path.is_file() else path.name) for path in sources]
     if all(sides) and len({*sides, *taken}) == len(sides) + len(taken):
         named = list(zip([str(side) for side in sides], sources))
         return sorted(named, key=lambda pair: list(SIDES).index(pair[0]))
@@ -137,7 +137,7 @@ def _moved(link: Path, place: Path) -> Path | None:
     return next((path for path in tried if is_footage(path)), None)
 
 
-def _side(stem: str) -> str | None:
+def side_of_name(stem: str) -> str | None:
     """L, C or R if a file's name contains exactly one side."""
     words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).lower())
     found = {SIDE_OF[word] for word in words if word in SIDE_OF}

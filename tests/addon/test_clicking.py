@@ -116,6 +116,19 @@ def test_skip_back_and_undo(session: Any) -> None:
     assert np.allclose(session.clicks()["C"], [-0.5, 287.5], atol=1e-3), "a click beside the image is put at its edge"
 
 
+def test_a_session_ends_when_every_joint_is_clicked_twice_or_skipped(session: Any) -> None:
+    first, *others = session.names
+    session.click("C", np.array([100.0, 80.0]))
+    for name in others:
+        session.go_to(name)
+        for view in session.views:
+            session.click(view, np.array([150.0, 120.0]))
+    assert session.name == first and session.missing() == {first: 1}, "the last joint is done, but one has a single click"
+    session.skip()
+    assert session.name == "" and session.missing() == {} and session.missing(skipped=True) == {first: 1}
+    assert session.back() and session.missing() == {first: 1}
+
+
 def test_a_click_near_the_proposal_takes_it(session: Any, truth: Truth) -> None:
     camera = dict(zip(session.views, session.finder.cameras))
     X = sleeve_point(session, truth, 0)

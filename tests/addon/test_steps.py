@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tricap.__main__ import main
-from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.geometry.rig import read_rig, renamed, write_rig
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.writing import read_table, write_table
@@ -85,15 +85,16 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     assert words() == "done ready done empty empty empty empty empty"
     assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 fps."
     assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
+    assert "Camera L" in scene.objects and scene.camera.name == "Camera C", "the cameras stand in the viewport"
     scene.tricap.model = "arm.R"
     assert words() == "done done ready ready empty empty empty empty"
     click(blender, read_table(sample)["seeds"]["joints"])
     assert words() == "done done done ready empty empty empty empty" and why("clicks") == "All 3 joints are clicked."
     scene.tricap.growing.spacing_px = 6
     assert blender.ops.tricap.measure() == {"FINISHED"}
-    assert words() == "done done done done ready empty empty empty"
+    assert words() == "done done done done ready empty empty empty" and "Cloud" in scene.objects
     assert blender.ops.tricap.track() == {"FINISHED"}
-    assert words() == "done done done done done ready empty empty"
+    assert words() == "done done done done done ready empty empty" and "Trajectories" in scene.objects
     assert blender.ops.tricap.fit() == {"FINISHED"}
     assert words() == "done done done done done done ready empty"
     assert blender.ops.tricap.build_scene() == {"FINISHED"}
@@ -246,7 +247,7 @@ def blank(folder: Path) -> None:
 
 WRONG = {
     "another size": "was calibrated with images of 640×480 pixels, its footage has 512×384",
-    "no camera for a view": "no camera “R”",
+    "no camera for a view": "No camera is called R; the calibration has L, C. Press Match Names",
     "no rig at all": "Cannot read the rig",
     "damaged rig": "rig.toml",
 }
@@ -693,3 +694,39 @@ def test_a_scene_whose_take_is_gone_says_so(blender: ModuleType, built: Path, tm
         assert words() == "done done done done done done done ready"
     finally:
         lost.rename(built / "take")
+
+
+def test_what_the_check_finds_is_mended_by_a_press(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    """Cameras with foreign names are matched as they are imported; swapped ones and interlaced footage by a button."""
+    scene = opened(blender, sample, tmp_path)
+    path = tmp_path / "take" / "rig.toml"
+    true = {camera.name: camera.t_cam_world_m for camera in read_rig(path).cameras}
+    foreign = tmp_path / "foreign.toml"
+    write_rig(foreign, renamed(read_rig(path), {"L": "cam_0", "C": "cam_1", "R": "cam_2"}))
+    assert blender.ops.tricap.cameras_from_file(filepath=str(foreign)) == {"FINISHED"}
+    assert {camera.name: camera.t_cam_world_m.tolist() for camera in read_rig(path).cameras} == {n: t.tolist() for n, t in true.items()}
+    write_rig(path, renamed(read_rig(path), {"L": "cam_0"}))
+    assert words().split()[1] == "failed" and blender.ops.tricap.match_names() == {"FINISHED"}
+    assert words().split()[1] == "done"
+    write_rig(path, renamed(read_rig(path), {"L": "C", "C": "L"}))
+    words()
+    assert blender.ops.tricap.check() == {"FINISHED"} and "are swapped" in scene.tricap.check_said
+    assert blender.ops.tricap.match_names() == {"FINISHED"}
+    assert {camera.name: camera.t_cam_world_m.tolist() for camera in read_rig(path).cameras} == {n: t.tolist() for n, t in true.items()}
+    assert not blender.ops.tricap.set_fields.poll()
+    words()
+    importlib.import_module(f"{NAME}.session").get_session().file.fields_found[scene.tricap.check_key] = "even"
+    assert blender.ops.tricap.set_fields() == {"FINISHED"}
+    assert (scene.tricap.interlaced, scene.tricap.first_field) == ("both", "even") and scene.frame_end == 5
+
+
+def test_the_check_begins_by_itself_once_for_each_input(blender: ModuleType, words: Words, sample: Path, tmp_path: Path) -> None:
+    check, session = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.check", "session"))
+    scene = opened(blender, sample, tmp_path)
+    words()
+    assert check.should_begin(scene)
+    session.get_session().file.changed = True
+    assert not check.should_begin(scene), "the user is still typing"
+    words()
+    session.get_session().file.checked_keys.add(importlib.import_module(f"{NAME}.steps.watch").current(scene).keys["measure"])
+    assert not check.should_begin(scene)
