@@ -14,7 +14,7 @@ from .canvas import Canvas, Colour
 from .layers import Inspection
 from .results import RunResults
 
-POINT_PX, LINE_PX = 3.0, 1.2
+POINT_PX, LINE_PX = 3.0, 2.2
 BODY: Colour = (1.0, 0.6, 0.1, 1.0)
 CONTOUR: Colour = (0.95, 0.3, 0.95, 1.0)
 NO_EDGE: Colour = (0.95, 0.3, 0.95, 0.35)

@@ -11,7 +11,7 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.mapping import MappedMotion, MappedRig
-from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
+from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, begun_at_rest
 from ...core.motion.retarget.rig import Motion, resampled
 from ...core.motion.sources import read_motion_source
 from ..jobs import JobOperator
@@ -80,7 +80,8 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Write the action and report how good it is."""
         props = context.scene.tricap_retarget
         preview.remove_preview(self._target)
-        outcome = apply.apply(self._target, result.source, self._mapped_target, result.result, self._name, props.tolerance_deg)
+        beside = begun_at_rest(result.result) if props.place == "SIDE" else result.result
+        outcome = apply.apply(self._target, result.source, self._mapped_target, beside, self._name, props.tolerance_deg)
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused_mapping]), *outcome.notes]

@@ -67,6 +67,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             body.use_property_split = True
             for field in dataclasses.fields(settings):
                 body.prop(group, field.name)
+    layout.row().prop(props, "place", expand=True)
     layout.prop(props, "tolerance_deg")
     layout.prop(props, "strip")
     buttons = layout.row(align=True)

@@ -25,6 +25,12 @@ EXPORTED = (
 )
 
 
+PLACES = (
+    ("SIDE", "Side by Side", "The target begins where it stands"),
+    ("SOURCE", "In Place", "The target moves where the source does"),
+)
+
+
 def _is_armature(_: bpy.types.PropertyGroup, thing: bpy.types.Object) -> bool:
     return bool(thing.type == "ARMATURE")
 
@@ -87,6 +93,11 @@ class Retargeting(bpy.types.PropertyGroup):
         max=10.0,
         default=0.0,  # type: ignore[valid-type]
         description="Remove keys as long as no rotation changes by more than this; 0: a key in every frame",
+    )
+    place: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Place",
+        items=PLACES,
+        description="Where the target plays the motion",
     )
     strip: bpy.props.BoolProperty(name="As NLA Strip", description="Push the action down to an NLA strip, to layer corrections over it")  # type: ignore[valid-type]
     settings: bpy.props.PointerProperty(type=Settings)  # type: ignore[valid-type]

@@ -5,7 +5,7 @@ read_contents (any thread) → write_scene (main thread) → save_blend
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,7 @@ SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names,
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
 PART_KEY = "tricap_part"  # custom property of the collections in it: Body, Cameras, Measured, …
+DOUBTFUL = "Doubtful"  # the first word of the timeline's markers of doubtful stretches
 KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
 
 
@@ -112,6 +113,7 @@ def write_scene(
     if surface is not None:
         skin.add_implicit(measured, *surface, potential_named(options.field))
     _add_studio(scene, collection, body, contents)
+    mark_doubtful(scene, contents.doubtful)
     if contents.bar is not None:
         counts["positions of the bar"] = _add_bar(_part(collection, "Bar"), contents.frames[0], *contents.bar)
     scene.frame_set(scene.frame_start)
@@ -198,6 +200,15 @@ def set_time(scene: bpy.types.Scene, contents: Contents) -> None:
     whole = max(1, math.ceil(contents.fps - 1e-6))
     scene.render.fps, scene.render.fps_base = whole, whole / contents.fps
     scene.frame_start, scene.frame_end = contents.frames
+
+
+def mark_doubtful(scene: bpy.types.Scene, stretches: Sequence[tuple[int, int, str]]) -> None:
+    """A marker in the timeline at the first frame of every doubtful stretch, with its frames and the reason; earlier ones are removed."""
+    for marker in [marker for marker in scene.timeline_markers if marker.name.startswith(DOUBTFUL)]:
+        scene.timeline_markers.remove(marker)
+    for first, last, reason in stretches:
+        frames = str(first) if first == last else f"{first}–{last}"
+        scene.timeline_markers.new(f"{DOUBTFUL} {frames}: {reason}", frame=first)
 
 
 def save_blend(path: Path) -> None:

@@ -23,6 +23,7 @@ from ...core.foundation.settings import from_table
 from ...core.motion.formats.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
 from ...core.results.run_json import read_run
+from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
 from ...core.take.footage import Footage, open_take
 from ...core.take.take import read_take
@@ -54,6 +55,7 @@ class Contents:
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
     skins: FrameSkins | None = None  # only on request
     prepared: Prepared = field(default_factory=Prepared)
+    doubtful: tuple[tuple[int, int, str], ...] = ()  # stretches of doubtful frames: first, last, reason
     bar: tuple[np.ndarray, np.ndarray] | None = None  # frames (T,) of its own recording, and ends (T, 2, 3) [m] of the reference bar
     warnings: tuple[str, ...] = ()
 
@@ -105,6 +107,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
         skin_settings=settings,
         prepared=prepared,
         skins=_skins(person, motion, settings, monitor, warnings) if skins else None,
+        doubtful=tuple(doubtful_stretches(read_frame_table(out / "frames.csv"))) if (out / "frames.csv").is_file() else (),
         bar=_bar(footage, warnings),
         warnings=tuple(warnings),
     )

@@ -193,6 +193,25 @@ class FrameTable:
         return badness, tuple(reasons)
 
 
+def doubtful_stretches(table: FrameTable) -> list[tuple[int, int, str]]:
+    """First and last frame of every run of doubtful frames, with the reason of the worst one.
+
+    A state of the fit that most frames share does not single out a frame.
+    """
+    usual = {state for state in table.fit if 2 * table.fit.count(state) > len(table.fit)}
+    badness, reasons = replace(table, fit=tuple("" if state in usual else state for state in table.fit)).badness()
+    found: list[tuple[int, int, str, float]] = []
+    for frame, bad, reason in zip(table.frames.tolist(), badness.tolist(), reasons):
+        if not reason:
+            continue
+        if found and found[-1][1] == frame - 1:
+            first, _, before, worst = found[-1]
+            found[-1] = (first, frame, *((reason, bad) if bad > worst else (before, worst)))
+        else:
+            found.append((frame, frame, reason, bad))
+    return [(first, last, reason) for first, last, reason, _ in found]
+
+
 def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
     """The table of a run, as far as it has come. Points are counted before corrections. Without measured frames, those of the body."""
     frames = np.array([f.frame for f in summaries] if summaries or body is None else body.motion.frames, dtype=np.int64)

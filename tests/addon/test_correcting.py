@@ -5,6 +5,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
@@ -135,3 +136,23 @@ def test_a_correction_makes_the_later_steps_stale(blender: ModuleType, scene: An
     blender.ops.tricap.list_dofs()
     scene.tricap_correcting.dofs["elbow.R twist"].locked = True
     assert keys()["track"] == before["track"] and keys()["fit"] != before["fit"]
+
+
+def test_a_joint_that_is_pulled_is_clicked_in_every_view(blender: ModuleType, scene: Any, small_run: SmallRun) -> None:
+    scene.tricap.out = str(small_run.out)
+    cameras = {camera.name: camera for camera in small_run.rig.cameras}
+    wrist, frame = small_run.joints_m["wrist.R"][1], 3
+    at = cameras["C"].project(wrist) + (4.0, -3.0)
+    assert blender.ops.tricap.pull_joint(name="wrist.R", view="C", x=at[0], y=at[1]) == {"FINISHED"}
+    clips, clicks = module("project").clips_of(scene), module("clicks")
+    got = {view: np.array(clicks.get_click(clip, "wrist.R", frame)) for view, clip in clips.items()}
+    depth = cameras["C"].to_camera(wrist)[2]
+    moved = cameras["C"].points_at_depth(at, depth)
+    for view, camera in cameras.items():
+        np.testing.assert_allclose(got[view], camera.project(moved), atol=0.02)
+    assert blender.ops.tricap.pull_joint(name="wrist.R", view="L", x=50, y=60) == {"FINISHED"}
+    assert np.allclose(clicks.get_click(clips["C"], "wrist.R", frame), got["C"]), "clicks that are there stay"
+    with pytest.raises(RuntimeError, match="no joint “tail”"):
+        blender.ops.tricap.pull_joint(name="tail", view="L", x=50, y=60)
+    with pytest.raises(RuntimeError, match="No body was fitted in frame 99"):
+        blender.ops.tricap.pull_joint(name="wrist.R", view="L", frame=99, x=50, y=60)

@@ -126,3 +126,14 @@ def test_what_cannot_be_edited(blender: ModuleType) -> None:
     body.animation_data.action = None
     with pytest.raises(RuntimeError, match="has no action to edit"):
         blender.ops.tricap.smooth_uncertain()
+
+
+def test_doubtful_stretches_are_marked_once(blender: ModuleType) -> None:
+    from tricap.addon.scene.build import mark_doubtful
+
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    scene = blender.context.scene
+    scene.timeline_markers.new("Jump", frame=3)
+    mark_doubtful(scene, [(2, 2, "few points"), (5, 9, "joints uncertain")])
+    mark_doubtful(scene, [(5, 9, "joints uncertain")])
+    assert {(m.name, m.frame) for m in scene.timeline_markers} == {("Jump", 3), ("Doubtful 5–9: joints uncertain", 5)}

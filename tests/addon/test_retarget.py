@@ -174,6 +174,13 @@ def test_an_action_is_a_source_and_comes_back(empty: ModuleType) -> None:
     assert np.degrees(angle_of(transposed(source.R) @ back.R))[:, ours].max() < 0.1
 
 
+def it_begins_where_it_stands(bpy: ModuleType, target: Any, props: Any) -> None:
+    hips = next(row.bones.partition(",")[0] for row in props.rows if row.role == "hips")
+    bpy.context.scene.frame_set(int(target.animation_data.action.frame_range[0]))
+    now, rest = target.pose.bones[hips].matrix.translation, target.data.bones[hips].head_local
+    assert props.place == "SIDE" and (now - rest).xy.length < 1e-4
+
+
 def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleType) -> None:
     bpy = blender
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
@@ -187,6 +194,7 @@ def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleTy
     assert bpy.ops.tricap.retarget() == {"FINISHED"}
     assert target.animation_data.action.name != former and "limb directions" in props.last
     assert [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points] == kept
+    it_begins_where_it_stands(bpy, target, props)
     the_step_is_undone(bpy, former)
     props = bpy.context.scene.tricap_retarget
     props.rows[0].bones = "nowhere"

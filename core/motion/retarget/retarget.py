@@ -68,6 +68,20 @@ class Retargeted:
         return replace(self.motion, head_m=self.motion.head_m + self.removed_travel_m[:, None])
 
 
+def begun_at_rest(result: Retargeted) -> Retargeted:
+    """The motion moved over the floor so that the body begins where it stands at rest. A motion without a carrier stays as it is."""
+    if result.carrier < 0:
+        return result
+    known = np.flatnonzero(np.isfinite(result.shift_m).all(axis=1))
+    aside_m = result.shift_m[known[0]] * (1.0, 1.0, 0.0) if len(known) else np.zeros(3)
+    return replace(
+        result,
+        motion=replace(result.motion, head_m=result.motion.head_m - aside_m),
+        shift_m=result.shift_m - aside_m,
+        loose_m={bone: shift - aside_m for bone, shift in result.loose_m.items()},
+    )
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Match:
     """Source and target, and what connects them."""

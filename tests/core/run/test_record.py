@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.run.record import COLUMNS, FrameTable, doubtful_frames, frame_table, read_frame_table, write_frame_table
+from tricap.core.run.record import (
+    COLUMNS,
+    FrameTable,
+    doubtful_frames,
+    doubtful_stretches,
+    frame_table,
+    read_frame_table,
+    write_frame_table,
+)
 from tricap.core.surface.frames import FrameSummary
 from tricap.core.tracking.trajectories import with_kinematics
 
@@ -68,6 +76,7 @@ def test_doubtful_frames() -> None:
     values["sigma_mm"] = np.array([1.0, 1.0, 4.0, 1.0, 2.0])
     states = FrameTable(frames=frames, values=values, fit=("partial", "partial", "partial", "bridged", "partial"))
     assert doubtful_frames(states, None) == {12: "points uncertain", 13: "fit bridged", 14: "points uncertain"}
+    assert doubtful_stretches(states) == [(12, 14, "points uncertain")]
     body: Any = SimpleNamespace(contradicted={"upper_arm.R": (11, 12), "shin.L": (12,)})
     found = doubtful_frames(states, body)
     assert list(found) == [11, 12, 13, 14] and found[12] == "the images contradict the right arm and the left lower leg"
