@@ -12,6 +12,7 @@ from ..session import get_session
 from .curves import BONE, keys_of, sigma_curves
 
 GREEN_DEG, RED_DEG = 1.0, 10.0
+QUARTILE = 0.75
 STRIP_PX, OPACITY, BONE_PX = 8.0, 0.9, 6.0
 EDITORS = ("SpaceDopeSheetEditor", "SpaceGraphEditor")
 
@@ -42,14 +43,15 @@ def colour_of(sigma_deg: np.ndarray) -> np.ndarray:
 
 
 def of_frames(sigmas: Sigmas, bones: set[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (T,) and in each the largest sigma (T,) of some bones; of all if none of them has one."""
-    chosen = [sigmas[name] for name in bones if name in sigmas] or list(sigmas.values())
+    """Frames (T,) and in each the largest sigma (T,) of some bones; of all bones, if none of these has one, the sigma that a quarter of
+    them exceeds, because some bone is uncertain in nearly every frame."""
+    chosen = [sigmas[name] for name in bones if name in sigmas]
+    part, chosen = (1.0, chosen) if chosen else (QUARTILE, list(sigmas.values()))
     frames = np.unique(np.concatenate([at for at, _ in chosen])) if chosen else np.zeros(0)
-    worst = np.zeros(len(frames))
-    for at, sigma in chosen:
-        rows = np.searchsorted(frames, at)
-        worst[rows] = np.maximum(worst[rows], sigma)
-    return frames, worst
+    values = np.zeros((len(chosen), len(frames)))
+    for row, (at, sigma) in enumerate(chosen):
+        values[row, np.searchsorted(frames, at)] = sigma
+    return frames, np.quantile(values, part, axis=0) if chosen else np.zeros(0)
 
 
 def begin() -> None:

@@ -1,7 +1,7 @@
 """bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity", …)"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -120,28 +120,32 @@ def put_into_scene(
     if body is not None:
         chosen.source, chosen.export = chosen.source or body, chosen.export or body
     if first and body is not None:
-        _frame(operator, context, [body])
+        _frame(operator, context, body)
 
 
 def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
-    """Show the results that there are: cameras, then the cloud, then trajectories. A scene with a body stays as it is, with its edits."""
+    """Show the results that there are over the footage: cameras, then the cloud, then trajectories.
+
+    A scene with a body stays as it is, with its edits. The first time, the 3-D views look through the scene's camera.
+    """
     if any(thing.type == "ARMATURE" for built in scene_build.built_collections(context.scene) for thing in built.all_objects):
         return
     first = not scene_build.built_collections(context.scene)
-    write_scene(replace(contents, warnings=(), shape=None, motion=None))
-    if first:
-        _frame(operator, context, [thing for built in scene_build.built_collections(context.scene) for thing in built.all_objects])
+    write_scene(replace(contents, warnings=(), shape=None, motion=None), options=replace(DEFAULTS, studio=False))
+    if first and context.window is not None and not bpy.app.background:
+        _hide_default_objects(operator, context)
+        for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
+            area.spaces.active.region_3d.view_perspective = "CAMERA"
 
 
-def _frame(operator: bpy.types.Operator, context: bpy.types.Context, things: Sequence[bpy.types.Object]) -> None:
-    """Frame these objects in the 3-D views, without the objects of Blender's startup file."""
+def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.types.Object) -> None:
+    """Frame the body in the 3-D views, without the objects of Blender's startup file."""
     if context.window is None or bpy.app.background:
         return
     _hide_default_objects(operator, context)
     for item in context.selected_objects:
         item.select_set(False)
-    for thing in things:
-        thing.select_set(True)
+    body.select_set(True)
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
         region = next(r for r in area.regions if r.type == "WINDOW")
         with context.temp_override(area=area, region=region):

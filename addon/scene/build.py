@@ -51,6 +51,7 @@ class SceneOptions:
     simplify_deg: float = 0.0  # above 0: the armature plays a second action with fewer keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
     arrows: bool = False  # velocities as arrows
+    studio: bool = True  # lights, floor and background
     frame: int | None = None  # of the implicit surface; None: the middle one
     most_points: int = 300_000  # of the cloud, and of the trajectories, in all frames together; more are thinned evenly
 
@@ -112,7 +113,8 @@ def write_scene(
     counts |= _add_body(body, contents, warnings, options, blend)
     if surface is not None:
         skin.add_implicit(measured, *surface, potential_named(options.field))
-    _add_studio(scene, collection, body, contents)
+    if options.studio:
+        _add_studio(scene, collection, body, contents)
     mark_doubtful(scene, contents.doubtful)
     if contents.bar is not None:
         counts["positions of the bar"] = _add_bar(_part(collection, "Bar"), contents.frames[0], *contents.bar)

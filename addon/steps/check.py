@@ -54,6 +54,7 @@ class Check(JobOperator, bpy.types.Operator):
         by_cause = {finding.cause: finding.figures for finding in result.findings}
         file.camera_of[props.check_key] = dict(by_cause.get(Cause.SWAPPED_VIEWS, {}).get("camera_of", {}))
         file.fields_found[props.check_key] = str(by_cause[Cause.COMBING]["first_field"] or "odd") if Cause.COMBING in by_cause else ""
+        context.window_manager.tricap_steps.cameras = context.window_manager.tricap_steps.cameras or not props.check_passed
         for line in props.check_said.splitlines():
             self.report({"INFO" if props.check_passed else "WARNING"}, line)
         return {"FINISHED"}
@@ -128,6 +129,13 @@ class SetFields(SimpleOperator, bpy.types.Operator):
             props.interlaced, props.first_field = before
             raise
         return f"Both fields are measured, the {'upper' if first == 'odd' else 'lower'} one first: every field is a frame now."
+
+
+def is_doubtful(scene: bpy.types.Scene) -> bool:
+    """Whether the last check found something, with the inputs as they are now."""
+    props, now = scene.tricap, watch.current(scene)
+    done = now.states["cameras"].status == states.Status.DONE
+    return done and bool(props.check_said) and not props.check_passed and props.check_key == now.keys.get("measure")
 
 
 def draw_mends(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -3,7 +3,7 @@
 import bpy
 
 from ..panels import TricapPanel, sentence
-from . import bodies, watch
+from . import bodies, check, watch
 from .states import STAGE, STEPS, TITLES, State, Status
 
 ICONS = {
@@ -56,8 +56,9 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         is_next = step == now.next and state.status in (Status.READY, Status.EMPTY)
         header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS[Status.READY if is_next else state.status])
         right = header.row()
-        right.alignment, right.alert = "RIGHT", state.status in (Status.FAILED, Status.STALE)
-        right.label(text=f"{'next' if is_next else LABELS[state.status]} ")
+        doubtful = step == "cameras" and check.is_doubtful(context.scene)
+        right.alignment, right.alert = "RIGHT", doubtful or state.status in (Status.FAILED, Status.STALE)
+        right.label(text=f"{'next' if is_next else 'doubtful' if doubtful else LABELS[state.status]} ")
         if body is None:
             return
         column = body.column()

@@ -114,6 +114,7 @@ def test_the_strip_shows_the_worst_of_the_chosen_bones(blender: ModuleType) -> N
     frames, worst = uncertainty.of_frames(sigmas, {"upper_arm.R"})
     np.testing.assert_allclose(worst[NOISY.start], np.degrees(0.2), rtol=1e-5)
     assert list(frames) == list(range(FRAMES)) and worst[0] == pytest.approx(0.5)
+    assert uncertainty.of_frames(sigmas, set())[1][NOISY.start] < np.degrees(0.2), "one uncertain bone does not make the body uncertain"
     green, red = uncertainty.colour_of(np.array([0.5, 12.0]))
     assert green[1] > green[0] and red[0] > red[1]
 
