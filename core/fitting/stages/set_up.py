@@ -188,7 +188,8 @@ def _found_clicks(clicks: Clicks, start: StartJoints, names: tuple[str, ...]) ->
     rows = [j for j, name in enumerate(names) if name in start.xyz_m and not np.isfinite(places[j]).all()]
     if rows:
         places[rows] = [start.xyz_m[names[j]] for j in rows]
-        observations.append(Keypoints(joint=np.array(rows), xyz_m=places[rows], sigma_m=np.full(len(rows), start.sigma_m)))
+        sigma = np.array([start.sigma_m(names[j]) for j in rows])
+        observations.append(Keypoints(joint=np.array(rows), xyz_m=places[rows], sigma_m=sigma))
     return initial_clicks(places, names, observations)
 
 

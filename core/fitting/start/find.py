@@ -3,15 +3,19 @@
 The frame in which most is seen of the person, and in which the limbs are furthest from the body, is searched, and another one shortly
 before or after (`search`). In each, the best hypotheses are adjusted (`refine`), lost limbs are looked for, and the best explanation gets
 rivals: the same limbs of a person who faces the other way, or with the legs exchanged, or one limb elsewhere. What is found in one frame is
-followed to the other. All explanations compete:
+followed to the others. All explanations compete:
 
     p_k = exp(S_k / τ) / Σ_j exp(S_j / τ)                                                                  (1)
 
-S is the number of voxels of both frames that an explanation accounts for; S/τ also contains log odds for walking forwards, because people
-seldom walk backwards. Explanations whose joints agree within `SAME_M` in both frames are one. The best one is uncertain unless each frame's
-own search finds it best: the right one may be missing among them. Each clicked joint halves that doubt. Where the best explanation is less
-probable than `fitting.least_start_probability`, a click is asked for: on the joint whose places in the explanations differ most. Clicked
-joints are observations in all steps.
+S is the number of voxels of all these frames that an explanation accounts for; S/τ also contains log odds for walking forwards, because
+people seldom walk backwards. Explanations whose joints agree within `SAME_M` in all of them are one. The best one is uncertain unless
+another frame's own search finds it best, too: the right one may be missing among them. If it does not, a third frame is searched. Each
+clicked joint halves that doubt. Where the best explanation is less probable than `fitting.least_start_probability`, a click is asked for:
+on the joint whose places in the explanations differ most. Clicked joints are observations in all steps, and a click that is missed makes
+the start improbable.
+
+Where an arm lies on the body is hardly seen in one frame: an adjustment that begins at the truth moves a wrist by up to 33 cm.
+Wrists therefore have a larger sigma (`StartJoints.sigma_m`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,15 +35,19 @@ from .refine import (
     carried,
     exchanged,
     limb_rivals,
+    missed_m,
     of_hypothesis,
     thinned_points,
+    with_clicks,
     with_lengths,
     with_limbs,
 )
 from .search import hypotheses, is_inside
 
 LOOKED_AT = 24  # frames of which the easiest is searched, and of those around it
-AROUND_S = (0.15, 0.4)  # between the two frames that are searched
+OUTLINE = 3.0  # voxels, by ray of an outline
+AROUND_S = (0.06, 0.4)  # between two frames that are searched
+SEARCHED = 3  # frames, at most
 FOLLOWED = 3  # explanations of a frame that are followed to the other
 UNCONFIRMED = 0.1  # the probability that no explanation is right, unless both frames find the best one; each clicked joint halves it
 TRIED, DIFFERENT_M, AMONG = 6, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
@@ -51,6 +59,7 @@ WALK_S = 0.3  # before and after a frame, for the velocity
 UNTRIED = "a pose that was not among those tried"
 UNLIKELY = 0.01  # a less probable rival is not named
 JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # joints by which explanations are compared
+MISSED_M = 0.07  # from a click to its joint: the probability of the start falls by e^(-½) at this distance
 EXCHANGES = {
     "front and back": ("hip", "knee", "ankle", "clavicle", "shoulder", "elbow", "wrist", "knuckles"),
     "the left and the right leg": ("knee", "ankle"),
@@ -101,44 +110,56 @@ def find_start(
     if not chosen:
         return None
     known, names = known_poses(fit.model.skeleton, without), fit.model.skeleton.joint_names
-    walk, parts = dict(zip(chosen, _velocities(points_of, chosen, time_s))), len(chosen) + 2
-    found = [_explained(fit, t, points_of(t), known, walk[t], monitor.part(STAGE, i, parts)) for i, t in enumerate(chosen)]
-    moving = monitor.part(STAGE, len(chosen), parts)
-    followed = [
-        Followed(found=one, elsewhere=[carried(fit, points_of, one, t, moving) for t in chosen if t != one.t])
-        for of_frame in found
-        for one in of_frame
-    ]
-    best = judged(fit, followed, walk)
+    walk, parts = dict(zip(chosen, _velocities(points_of, chosen, time_s))), 2 * SEARCHED + 1
+    found = list[list[Explanation]]()
+    for i, t in enumerate(chosen):
+        found.append(_explained(fit, t, points_of(t), known, walk[t], monitor.part(STAGE, 2 * i, parts)))
+        if i or len(chosen) == 1:
+            best = judged(fit, _everywhere(fit, points_of, found, monitor.part(STAGE, 2 * i + 1, parts)), walk)
+            if is_confirmed(best.followed[0], found, names):
+                break
     at = chosen[0] if fit.clicked else best.followed[0].found.t
     clicked = np.unique(fit.clicked[at].joint) if fit.clicked else np.zeros(0, dtype=np.intp)
     doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(clicked)
     explanations = [one.at(at) for one in best.followed]
-    thin = thinned_points(points_of(at))
-    final, stature = with_lengths(fit, thin, explanations[0], monitor.part(STAGE, parts - 1, parts))
+    thin, last = thinned_points(points_of(at)), monitor.part(STAGE, parts - 1, parts)
+    final, stature = with_lengths(fit, thin, with_clicks(fit, thin, explanations[0], last), last)
+    kept = (1 - doubt) * np.exp(-0.5 * (missed_m(fit, final) / MISSED_M) ** 2)
+    doubt = 1 - float(kept)
     return StartJoints(
         frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
         stature=stature,
         model=fit.model.name,
-        probability=(1 - doubt) * float(best.probability[0]),
-        rivals=_named(explanations, (1 - doubt) * best.probability, names) | ({UNTRIED: doubt} if doubt >= UNLIKELY else {}),
+        probability=kept * float(best.probability[0]),
+        rivals=_named(explanations, kept * best.probability, names) | ({UNTRIED: doubt} if doubt >= UNLIKELY else {}),
         ask=_decisive(explanations, np.maximum(best.probability, doubt), names, clicked),
     )
 
 
+def _everywhere(
+    fit: FitContext, points_of: Callable[[int], CloudPoints], found: Sequence[Sequence[Explanation]], monitor: Monitor
+) -> list[Followed]:
+    """The explanations of each frame, followed to the other frames that were searched."""
+    chosen = [of_frame[0].t for of_frame in found]
+    return [
+        Followed(found=one, elsewhere=[carried(fit, points_of, one, t, monitor) for t in chosen if t != one.t])
+        for of_frame in found
+        for one in of_frame
+    ]
+
+
 def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], time_s: np.ndarray, monitor: Monitor) -> list[int]:
-    """The frame indices to search: the easiest one, of those with clicks if there are any, and the easiest around it (`AROUND_S`).
+    """The frame indices to search: the easiest one, of those with clicks if there are any, then the easiest ones around it (`AROUND_S`).
 
     Only frames with enough points, in which the image shows the whole person.
     """
-    first = _easiest(fit, points_of, sorted(fit.clicked) or _spread(np.arange(len(time_s)), LOOKED_AT), monitor)
-    if first is None:
-        return []
-    apart = np.abs(time_s - time_s[first])
-    around = _spread(np.flatnonzero((apart >= AROUND_S[0]) & (apart <= AROUND_S[1])), LOOKED_AT)
-    second = _easiest(fit, points_of, around, monitor)
-    return [first] if second is None else [first, second]
+    chosen, some = list[int](), sorted(fit.clicked) or _spread(np.arange(len(time_s)), LOOKED_AT)
+    while len(chosen) < SEARCHED and (easiest := _easiest(fit, points_of, some, monitor)) is not None:
+        chosen.append(easiest)
+        apart = np.abs(time_s[:, None] - time_s[chosen])
+        some = _spread(np.flatnonzero((apart >= AROUND_S[0]).all(axis=1) & (apart[:, 0] <= AROUND_S[1])), LOOKED_AT)
+    return chosen
 
 
 def _spread(rows: np.ndarray, count: int) -> list[int]:
@@ -157,9 +178,12 @@ def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Seq
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:
-    """Voxels with points, and the length of the outline in the same unit: limbs apart from the body make it longer."""
+    """Voxels with points, the area of the person's cells, and the length of the outline: limbs apart from the body make it longer."""
     outline = sum(len(rays.sigma_m) for rays in fit.silhouettes.observe(t, fit.parameters.state(_at(fit, points), fit.parameters.vector())))
-    return len(points.xyz_m) + float(outline)
+    middle = np.median(points.xyz_m, axis=0)
+    seen = fit.seen(t, points)
+    cells = sum(seen.cell_area(view, middle) * len(view.xy_px) for view in seen.cells)
+    return len(points.xyz_m) + cells + OUTLINE * outline
 
 
 def _at(fit: FitContext, points: CloudPoints) -> np.ndarray:

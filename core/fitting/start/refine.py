@@ -10,6 +10,7 @@ from ..context import FitContext
 from ..explained import limb_gains
 from ..inputs.clicks import Clicks
 from ..inputs.cloud_points import CloudPoints
+from ..inputs.start_joints import StartJoints
 from ..limb import whole_limbs
 from ..observations import Keypoints, Observation
 from ..segmentation import SegmentationCache, crop
@@ -154,6 +155,35 @@ def with_lengths(fit: FitContext, points: CloudPoints, found: Explanation, monit
     near = adjusted(fit, points, found, ((1.5, LENGTH_STEPS),), monitor, "lengths")
     lengths = fit.parameters.layout.group("lengths")
     return near, float(np.exp(np.mean(near.vector[lengths] - fit.parameters.vector()[lengths])))
+
+
+def with_clicks(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:
+    """The same, or what begins with the clicked joints of its frame where they were clicked, if it misses them less."""
+    if found.t not in fit.clicked:
+        return found
+    names, joint = fit.model.skeleton.joint_names, np.unique(fit.clicked[found.t].joint)
+    others = np.setdiff1d(np.arange(len(names)), joint)
+    sigma = np.array([StartJoints.sigma_m(names[j]) for j in others.tolist()])
+    there = Keypoints(joint=others, xyz_m=found.joints_m[others], sigma_m=sigma)
+    at = fit.places[found.t]
+    places = np.where(np.isfinite(at).all(axis=1)[:, None], at, found.joints_m)
+    clicks = Clicks(observations=(there, fit.clicked[found.t]), xyz_m=places)
+    pose = inverse_kinematics(fit.parameters, clicks, fit.priors, fit.proportions).motion[0]
+    pose[fit.model.skeleton.locked] = found.pose[fit.model.skeleton.locked]
+    start = explanation(fit, found.t, points, pose, found.vector)
+    return min(found, adjusted(fit, points, start, ROUNDS[-1:], monitor), key=lambda one: missed_m(fit, one))
+
+
+def missed_m(fit: FitContext, found: Explanation) -> float:
+    """The distance [m] across the view by which the most distant clicked joint of its frame misses its click."""
+    if found.t not in fit.clicked:
+        return 0.0
+    clicks, distance = fit.clicked[found.t], [0.0]
+    for camera, joint, xy in zip(clicks.cameras, clicks.joint.tolist(), clicks.xy_px):
+        X = found.joints_m[joint][None]
+        off = float(np.linalg.norm(camera.project(X)[0] - xy)) * float(camera.to_camera(X)[0, 2]) / camera.focal_px
+        distance.append(off if np.isfinite(off) else np.inf)
+    return max(distance)
 
 
 def of_hypothesis(fit: FitContext, t: int, points: CloudPoints, pose: np.ndarray, stature: float, monitor: Monitor) -> Explanation:

@@ -18,7 +18,7 @@ from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_st
 from tricap.core.fitting.start import find, search
 from tricap.core.fitting.start.find import Followed, _decisive, _difference, is_confirmed, judged
 from tricap.core.fitting.start.pose_dictionary import known_poses
-from tricap.core.fitting.start.refine import Explanation
+from tricap.core.fitting.start.refine import Explanation, missed_m
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run.joints import write_joints_as_clicks
@@ -77,6 +77,7 @@ def test_a_person_is_found_from_points_alone(quick) -> None:
     assert found is not None and found.frame == 0 and abs(found.stature - 1) < 0.06
     off = {name: np.linalg.norm(found.xyz_m[name] - place) for name, place in zip(NAMES, _joints(pose)) if name[:-2] in find.JUDGED}
     assert max(off.values()) < 0.15, off
+    assert StartJoints.sigma_m("wrist.R") >= 2 * StartJoints.sigma_m("knee.R")  # one frame hardly shows where an arm lies
     assert (
         0 < found.probability <= 1 - find.UNCONFIRMED < SETTINGS.least_start_probability and find.UNTRIED in found.rivals
     )  # a single frame
@@ -150,8 +151,8 @@ def _judged(*found: Followed, velocity: tuple[float, float, float] = (0.0, 0.0, 
 
 
 def _moved(joints: np.ndarray) -> np.ndarray:
-    """The same with the right wrist elsewhere."""
-    return joints + np.where(np.array(NAMES)[:, None] == "wrist.R", [0.4, 0.0, 0.0], 0.0)
+    """The same with the right ankle elsewhere."""
+    return joints + np.where(np.array(NAMES)[:, None] == "ankle.R", [0.4, 0.0, 0.0], 0.0)
 
 
 def test_probabilities_and_the_click_that_decides() -> None:
@@ -160,9 +161,9 @@ def test_probabilities_and_the_click_that_decides() -> None:
     found = _judged(*(Followed(found=_explained(joints, score)) for score, joints in scores.items()))
     explanations = [one.found for one in found.followed]
     assert len(explanations) == 2 and np.allclose(found.probability, [1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1))])
-    assert _decisive(explanations, found.probability, NAMES, np.zeros(0, int)) == "wrist.R"
-    assert _decisive(explanations, found.probability, NAMES, np.array([NAMES.index("wrist.R")])) != "wrist.R"  # clicked already
-    assert _difference(*explanations, NAMES) == "where the right arm is"
+    assert _decisive(explanations, found.probability, NAMES, np.zeros(0, int)) == "ankle.R"
+    assert _decisive(explanations, found.probability, NAMES, np.array([NAMES.index("ankle.R")])) != "ankle.R"  # clicked already
+    assert _difference(*explanations, NAMES) == "where the right leg is"
     both = [Followed(found=_explained(joints, 1000.0)) for joints in (right, _turned(right))]
     back = _judged(*both, velocity=(0.0, -1.0, 0.0))
     assert back.probability[0] > 0.85 and back.followed[0].found.joints_m is right  # who walks faces forwards
@@ -186,6 +187,22 @@ def test_an_explanation_of_one_frame_alone_is_not_certain() -> None:
     better = _explained(_moved(right), 950.0, 1)
     assert not is_confirmed(one, [[one.found], [better, _explained(right, 900.0, 1)]], NAMES)  # by a worse rival of that frame
     assert not is_confirmed(one, [[one.found]], NAMES)
+
+
+def _clicked(joints: np.ndarray, name: str) -> SimpleNamespace:
+    """A fit in which a joint is clicked, in all views of frame index 0."""
+    cameras = front_rig().cameras
+    row, xyz = NAMES.index(name), joints[NAMES.index(name)]
+    xy = np.stack([camera.project(xyz[None])[0] for camera in cameras])
+    return SimpleNamespace(clicked={0: SimpleNamespace(cameras=cameras, joint=np.full(len(cameras), row), xy_px=xy)})
+
+
+def test_a_missed_click_is_measured_across_the_view() -> None:
+    right = _joints(_pose(0.0))
+    fit = _clicked(right, "ankle.R")
+    assert missed_m(fit, _explained(right, 0.0)) < 1e-9 and missed_m(fit, _explained(right, 0.0, 1)) == 0.0  # no clicks in frame 1
+    assert 0.3 < missed_m(fit, _explained(_moved(right), 0.0)) < 0.45
+    assert np.exp(-0.5 * (0.26 / find.MISSED_M) ** 2) < 0.01  # so that a start with a clicked joint 26 cm off is not used
 
 
 def _write_take(folder: Path, clicks: str) -> None:
