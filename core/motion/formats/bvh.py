@@ -17,6 +17,7 @@ from ..retarget.rig import Motion, Rig
 
 DEEPEST = 256  # joints in a chain: a tail or a braid has some dozens
 MOST_JOINTS = 4096
+LEAST_CELLS, MOST_STILL = 500_000, 2  # joints × frames: so many in any case, and so many for every value of the file
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 TALL_M = 1.7  # height of a person, for the unit
 TINY = 1e-6  # by the skeleton's size: bones below it have no length
@@ -55,6 +56,10 @@ def read_bvh(path: Path, *, unit_m: float | None = None, up: str | None = None) 
     if any(column >= count for j in joints for column in j.columns):
         raise InputError(f"{path} gives a joint its CHANNELS twice; it is damaged, export it again.")
     values, fps = _values(body, count, path)
+    if len(values) * len(joints) > max(LEAST_CELLS, MOST_STILL * values.size):
+        raise InputError(
+            f"{path} has only {values.size} values for {len(joints)} joints in {len(values)} frames; it is damaged, export it again."
+        )
     return _motion(joints, values, fps, unit_m, up)
 
 

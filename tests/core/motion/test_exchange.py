@@ -256,6 +256,16 @@ def test_damaged_bvh_is_said(tmp_path: Path, old: str, new: str, word: str) -> N
         read_bvh(tmp_path / "a.bvh")
 
 
+@pytest.mark.parametrize(("channels", "still", "frames"), [("0", 0, 2_000_000_000), ("1 Zrotation", 400, 2_000)])
+def test_a_bvh_whose_joints_have_no_channels_asks_for_no_memory(tmp_path: Path, channels: str, still: int, frames: int) -> None:
+    """A small file cannot promise billions of frames of no values, or many joints that never move."""
+    joints = "JOINT a { OFFSET 0 0 1 }\n" * still
+    head = f"HIERARCHY\nROOT r {{\nOFFSET 0 1 0\nCHANNELS {channels}\n{joints}}}\nMOTION\nFrames: {frames}\nFrame Time: 0.04\n"
+    (tmp_path / "a.bvh").write_text(head + "0\n" * (frames if still else 0))
+    with pytest.raises(InputError, match="only .* values for .* joints"):
+        read_bvh(tmp_path / "a.bvh")
+
+
 def test_damaged_points_are_said(tmp_path: Path) -> None:
     write_c3d(tmp_path / "a.c3d", cloud())
     data = (tmp_path / "a.c3d").read_bytes()
