@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -84,14 +85,16 @@ def run_batch(
 
 def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     """The folder of each take's results: named after the take, with its parent folder's name in front where two takes have the same name.
+    Names that differ only in capitals are the same, as on the disks of Windows and macOS.
 
     Raises:
         InputError: two names are still the same, or results would go into a take or through a link out of FOLDER.
     """
     folder, takes = real_path(folder), [real_path(take) for take in takes]
-    names = [take.name for take in takes]
-    names = [f"{take.parent.name}_{take.name}" if names.count(take.name) > 1 else take.name for take in takes]
-    twice = next((take for take, name in zip(takes, names) if names.count(name) > 1), None)
+    same = Counter(take.name.casefold() for take in takes)
+    names = [f"{take.parent.name}_{take.name}" if same[take.name.casefold()] > 1 else take.name for take in takes]
+    same = Counter(map(str.casefold, names))
+    twice = next((take for take, name in zip(takes, names) if same[name.casefold()] > 1), None)
     if twice is not None:
         raise InputError(f"The take {twice} is listed twice, or has the name of another one; rename its folder, or leave it out.")
     for out in (folder, *(folder / name for name in names)):

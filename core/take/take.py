@@ -57,7 +57,8 @@ TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY = "none"  # `model` under [body]
-UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name is used in file names
+DEVICES = r"^(con|prn|aux|nul|com[1-9¹²³]|lpt[1-9¹²³]) *(\.|$)"  # of Windows, whatever follows the dot
+UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|[. ]$|' + DEVICES, re.IGNORECASE)  # a view's name is used in file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -255,13 +256,13 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
             raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
         if UNFIT_FOR_NAMES.search(entry["name"]):
-            raise InputError(f'The {label} has a character in its name that is not allowed in file names; choose a plain name such as "L".')
+            raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
         views.append(View(name=entry["name"], offset_frames=offset, **files))
-    if len({v.name for v in views}) < len(views):
-        raise InputError(f"Two views of {where} have the same name; give each its own.")
+    if len({v.name.casefold() for v in views}) < len(views):
+        raise InputError(f"Two views of {where} have the same name, or names that differ only in capitals; give each its own.")
     return tuple(views)
 
 

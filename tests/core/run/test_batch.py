@@ -167,6 +167,7 @@ def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, m
 def test_names_of_results(tmp_path: Path) -> None:
     a, b, c = tmp_path / "monday" / "kick", tmp_path / "tuesday" / "kick", tmp_path / "throw"
     assert [p.name for p in out_folders([a, b, c], tmp_path)] == ["monday_kick", "tuesday_kick", "throw"]
+    assert [p.name for p in out_folders([a, tmp_path / "tuesday" / "Kick"], tmp_path)] == ["monday_kick", "tuesday_Kick"]  # macOS, Windows
     with pytest.raises(InputError, match="is listed twice"):
         out_folders([a, a], tmp_path)
 
