@@ -1,5 +1,6 @@
 """Rigs and motions from files: .blend, glTF, VRM and FBX through Blender's importers, the rest through core's readers."""
 
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -121,9 +122,16 @@ def _try(load: Callable[[], object], path: Path) -> None:
         bounded.check_file(path, bounded.ARRAYS_BYTES)
         load()
     except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        reason = lines[-1][:200] if lines else type(error).__name__
-        raise InputError(f"Blender cannot read {path} ({reason}); it is damaged or in another format; export it again.") from error
+        raise InputError(f"Blender cannot read {path} ({_reason(error)}); it is damaged or in another format; export it again.") from error
+
+
+def _reason(error: Exception) -> str:
+    """What an importer complains of. Its text may be a traceback, which Blender cuts, and then ends with the place in our code."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line) and not line.endswith(":")]
+    if not reasons and "Traceback" in str(error):
+        return "its importer fails"
+    return (reasons or lines or [type(error).__name__])[-1][:200]
 
 
 def the_armature(name: str, what: str) -> bpy.types.Object:
