@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 
 from ...core.body.model_file import read_model
+from ...core.body.motion import GUESSED, INFERRED
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
 from ...core.fitting.settings import START_ALONE
 from ...core.foundation.bounded import real_path
@@ -285,7 +286,12 @@ def _figures(step: str, entry: Mapping[str, Any]) -> str:
         return f"{entry['points_per_frame']:.0f} points per frame, accurate to {entry['sigma_mm']:.2f} mm (1 sigma).{missed}"
     if step == "tracks":
         return f"{entry['trajectories']} trajectories, {entry['mean_length_frames']:.0f} frames long on average."
-    return f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
+    text = f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
+    for word in (GUESSED, INFERRED):
+        limbs = {limb: n for limb, counts in entry.get("limbs", {}).items() if (n := counts.get(word, 0))}
+        listed = ", ".join(f"{limb} in {n:.0f} {'frame' if n == 1 else 'frames'}" for limb, n in limbs.items())
+        text += f" {word.capitalize()}: {listed}." if limbs else ""
+    return text
 
 
 def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -> State:

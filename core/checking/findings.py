@@ -86,10 +86,11 @@ class Checked:
     kind: str
     findings: tuple[Finding, ...]
     figures: Mapping[str, Any]
+    notes: tuple[str, ...] = ()  # lines that are no findings
 
     def lines(self) -> list[str]:
-        """The findings, or a line that there are none."""
-        return [f"{self.subject}: no problems found."] if not self.findings else [str(f) for f in self.findings]
+        """The findings, or a line that there are none; then the notes."""
+        return [*([f"{self.subject}: no problems found."] if not self.findings else map(str, self.findings)), *self.notes]
 
     def to_table(self) -> dict[str, Any]:
         """As a plain table, for JSON."""
@@ -99,4 +100,5 @@ class Checked:
             "good": not self.findings,
             "findings": [f.to_table() for f in self.findings],
             "figures": dict(self.figures),
+            "notes": list(self.notes),
         }

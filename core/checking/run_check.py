@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..body.limb_words import counts, limb_words, sentence
 from ..body.model_file import read_model, with_limits
 from ..body.motion import BodyFit, BodyMotion
 from ..body.shape import BodyShape, read_body
@@ -19,7 +20,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..motion.formats.ply import read_ply
-from ..motion.tables import MotionTable, read_joints, read_motion
+from ..motion.tables import JointTable, MotionTable, read_joints, read_motion
 from ..results.run_json import read_run
 from .findings import Cause, Checked, Finding, doubtful, wrong
 
@@ -39,6 +40,7 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
     """All checks of the folder of a run."""
     findings: list[Finding] = []
     figures: dict[str, Any] = {}
+    notes: list[str] = []
     try:
         run = read_run(folder / "run.json")
         _refuse_parts(run, folder)
@@ -47,9 +49,19 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
             findings += _clouds(run, folder, figures, monitor)
         if (folder / "motion.csv").exists():
             findings += _body(folder, figures)
+            notes = _limbs(read_joints(folder / "joints.csv"), figures)
     except InputError as error:
         findings.append(wrong(Cause.INPUT, str(error)))
-    return Checked(subject=str(folder), kind="result", findings=tuple(findings), figures=figures)
+    return Checked(subject=str(folder), kind="result", findings=tuple(findings), figures=figures, notes=tuple(notes))
+
+
+def _limbs(joints: JointTable, figures: dict[str, Any]) -> list[str]:
+    """A line for each limb: in which frames it was seen, inferred or guessed; none for a file of an earlier version."""
+    if not joints.known or any("" in row for row in joints.known.values()):
+        return []
+    frames, words = joints.frames.tolist(), limb_words(tuple(joints.known), list(zip(*joints.known.values())))
+    figures["limbs"] = counts(words)
+    return [sentence(limb, frames, row) for limb, row in words.items()]
 
 
 def _refuse_parts(run: Mapping[str, Any], folder: Path) -> None:

@@ -1,6 +1,8 @@
 """Motion as tables for people and other programs: joints.csv and motion.csv.
 
-joints.csv  one row per frame and joint: frame, time_s, joint, x, y, z [m, world], sigma [m, mean standard deviation of a coordinate].
+joints.csv  one row per frame and joint: frame, time_s, joint, x, y, z [m, world], sigma [m, mean standard deviation of a coordinate],
+            sigma_frame [m, the part of it that is not common to all frames], known (seen, inferred or guessed). Files of earlier versions
+            lack the last two.
 motion.csv  one row per frame: frame, time_s, one column per DOF (its name; degrees, base positions in metres), then one
             `sigma <name>` column each in the same unit. Angles are those of the bones' pose channels, 0 in the rest pose.
 """
@@ -13,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body.motion import BodyMotion
+from ..body.motion import KNOWN, BodyMotion
 from ..body.skeleton import Skeleton
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse, frozen
@@ -21,6 +23,7 @@ from ..foundation.errors import InputError
 
 LARGEST_FRAME = 2**53
 JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
+LATER_COLUMNS = ("sigma_frame", "known")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -42,12 +45,15 @@ class MotionTable:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class JointTable:
-    """The content of joints.csv: positions (T, 3) [m] and sigmas (T,) by joint; NaN where a frame lacks the joint."""
+    """The content of joints.csv: positions (T, 3) [m], sigmas (T,) and words (T,) of KNOWN by joint; NaN and "" where a frame lacks the
+    joint, or the file these columns."""
 
     frames: np.ndarray  # (T,)
     time_s: np.ndarray  # (T,)
     joints_m: Mapping[str, np.ndarray]
     sigma_m: Mapping[str, np.ndarray]
+    frame_sigma_m: Mapping[str, np.ndarray]
+    known: Mapping[str, tuple[str, ...]]
 
 
 def write_joints(path: Path, motion: BodyMotion) -> None:
@@ -57,11 +63,13 @@ def write_joints(path: Path, motion: BodyMotion) -> None:
         InputError: the file cannot be written.
     """
     rows = [
-        [frame, f"{time:.6f}", joint, *(f"{c:.6f}" for c in X), f"{sigma:.6f}"]
-        for frame, time, places, sigmas in zip(motion.frames, motion.time_s, motion.joints_m, motion.joint_sigma_m)
-        for joint, X, sigma in zip(motion.joint_names, places, sigmas)
+        [frame, f"{time:.6f}", joint, *(f"{c:.6f}" for c in X), f"{sigma:.6f}", f"{own:.6f}", word]
+        for frame, time, places, sigmas, owns, words in zip(
+            motion.frames, motion.time_s, motion.joints_m, motion.joint_sigma_m, motion.joint_frame_sigma_m, motion.known
+        )
+        for joint, X, sigma, own, word in zip(motion.joint_names, places, sigmas, owns, words)
     ]
-    _write(path, JOINT_COLUMNS, rows)
+    _write(path, (*JOINT_COLUMNS, *LATER_COLUMNS), rows)
 
 
 def write_motion(path: Path, motion: BodyMotion, skeleton: Skeleton) -> None:
@@ -103,20 +111,26 @@ def read_joints(path: Path) -> JointTable:
     """
     header, rows = _read(path)
     columns = {name: _column(header, name, path) for name in JOINT_COLUMNS}
+    frame_sigma, word = (header.index(name) if name in header else None for name in LATER_COLUMNS)
     times: dict[int, float] = {}
     found: dict[str, dict[int, list[float]]] = {}
+    words: dict[str, dict[int, str]] = {}
     for line, row in enumerate(rows, 2):
         frame = _whole(row[columns["frame"]], path, line)
         times[frame] = _number(row[columns["time_s"]], path, line)
-        found.setdefault(row[columns["joint"]], {})[frame] = [_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")]
+        joint, own = row[columns["joint"]], np.nan if frame_sigma is None else _number(row[frame_sigma], path, line)
+        found.setdefault(joint, {})[frame] = [*(_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")), own]
+        words.setdefault(joint, {})[frame] = "" if word is None else _word(row[word], path, line)
     frames = sorted(times)
     check_sparse(len(rows), len(frames), len(found), path)
-    tables = {joint: np.array([places.get(f, [np.nan] * 4) for f in frames]) for joint, places in found.items()}
+    tables = {joint: np.array([places.get(f, [np.nan] * 5) for f in frames]) for joint, places in found.items()}
     return JointTable(
         frames=np.array(frames, dtype=np.int64),
         time_s=np.array([times[f] for f in frames]),
         joints_m={joint: t[:, :3] for joint, t in tables.items()},
         sigma_m={joint: t[:, 3] for joint, t in tables.items()},
+        frame_sigma_m={joint: t[:, 4] for joint, t in tables.items()},
+        known={joint: tuple(row.get(f, "") for f in frames) for joint, row in words.items()},
     )
 
 
@@ -151,6 +165,12 @@ def _column(header: Sequence[str], name: str, path: Path) -> int:
     if name not in header:
         raise InputError(f"The table {path} has no column “{name}”; if it belongs to this body, run the fit again.")
     return list(header).index(name)
+
+
+def _word(text: str, path: Path, line: int) -> str:
+    if text not in ("", *KNOWN):
+        raise InputError(f"Row {line} of {path} has “{text[:40]}” for “known”, not {', '.join(KNOWN)}; run the fit again.")
+    return text
 
 
 def _whole(text: str, path: Path, line: int) -> int:

@@ -16,7 +16,7 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..motion.formats.ply import read_ply
-from ..motion.tables import read_joints
+from ..motion.tables import JointTable, read_joints
 from ..results.folder import Results
 from ..take.footage import Footage
 from .overview import sigma_colours
@@ -49,7 +49,7 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
         for t, frame in enumerate(joints.frames.tolist()):
             monitor.step("film", t, len(joints.frames))
             mesh = read_ply(results.path("skin", f"{frame:04d}.ply"))
-            places = {name: (xyz[t], joints.sigma_m[name][t]) for name, xyz in joints.joints_m.items()}
+            places = {name: (xyz[t], _sigma(joints, name)[t]) for name, xyz in joints.joints_m.items()}
             panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(footage.read(frame), cameras)]
             movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s   views {', '.join(c.name for c in cameras)}"))
         movie.release()
@@ -67,6 +67,12 @@ def _smaller(cameras: tuple[Camera, ...]) -> list[Camera]:
     """The cameras of images that fit side by side into the movie."""
     factor = min(1.0, WIDTH_PX / sum(c.size_px[0] for c in cameras))
     return [c.resized((round(c.size_px[0] * factor), round(c.size_px[1] * factor))) for c in cameras]
+
+
+def _sigma(joints: JointTable, name: str) -> np.ndarray:
+    """The sigmas (T,) [m] of a joint, as in the report; files of earlier versions have only the whole ones."""
+    own = joints.frame_sigma_m[name]
+    return np.where(np.isfinite(own), own, joints.sigma_m[name])
 
 
 def _panel(

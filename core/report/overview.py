@@ -6,7 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..body.motion import BRIDGED, PARTIAL, SUSPECT, BodyFit
+from ..body.limb_words import FEW_FRAMES, limb_words
+from ..body.motion import BRIDGED, GUESSED, PARTIAL, SUSPECT, BodyFit
 from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
@@ -19,7 +20,7 @@ PREDICTED = {
 }
 SIGMAS_MM = np.array([1.0, 7.0, 50.0])  # of joints; their colours are
 COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
-LEGEND = "Colour: reported sigma of the joints; blue 1 mm or less, yellow 7 mm, red 50 mm or more."
+LEGEND = "Colour: sigma of the joints in this frame, without what is common to all; blue 1 mm or less, yellow 7 mm, red 50 mm or more."
 CELL_PX = 300  # height of a picture of the strip
 MARGIN = 1.3  # of a picture about the body
 OPACITY = 0.6
@@ -32,15 +33,18 @@ def verdict(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> s
     if body is None:
         return " ".join([_of_surface(stages), f"No body was fitted: {stages.get('fit', {}).get('not_done', 'it was not asked for')}."])
     motion = body.motion
-    sigma = 1e3 * np.median(motion.joint_sigma_m, axis=0)
+    sigma, own = (1e3 * np.median(s, axis=0) for s in (motion.joint_sigma_m, motion.joint_frame_sigma_m))
     worst, frames = int(sigma.argmax()), len(motion.frames)
     predicted = {words: motion.status.count(status) for status, words in PREDICTED.items() if status in motion.status}
     less = "; ".join(f"in {n if n < frames else 'all'} of them {words}" for words, n in predicted.items())
     text = (
         f"The body was fitted in {frames} frames{f'; {less}' if less else ''}. "
-        f"Reported sigma of its joints: {np.median(sigma):.1f} mm (median), "
+        f"Reported sigma of its joints: {np.median(sigma):.1f} mm (median; {np.median(own):.1f} mm without what is common to all frames), "
         f"largest at {motion.joint_names[worst]} with {sigma[worst]:.0f} mm."
     )
+    guessed = [limb for limb, row in limb_words(motion.joint_names, motion.known).items() if row.count(GUESSED) > FEW_FRAMES]
+    if guessed:
+        text = f"{text} The {' and the '.join(guessed)} {'are' if len(guessed) > 1 else 'is'} guessed in some frames."
     contradicted = len({frame for frames in body.contradicted.values() for frame in frames})
     if contradicted:
         return f"{text} The images contradict it in {contradicted} frames: do not use these before you have looked at them."
@@ -65,8 +69,8 @@ def sigma_colours(sigma_mm: np.ndarray) -> np.ndarray:
 
 
 def bone_sigma_mm(body: BodyFit, index: int) -> np.ndarray:
-    """The larger sigma (B,) of the two joints at a bone's ends, in one frame."""
-    names, sigma = body.motion.joint_names, 1e3 * body.motion.joint_sigma_m[index]
+    """The larger sigma (B,) of the two joints at a bone's ends, in one frame, without what is common to all frames."""
+    names, sigma = body.motion.joint_names, 1e3 * body.motion.joint_frame_sigma_m[index]
     ends = [[names.index(joint) for joint in (bone.head_joint, bone.tail_joint)] for bone in body.shape.skeleton.bones]
     return np.asarray(sigma[np.array(ends)].max(axis=1))
 

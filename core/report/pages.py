@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..body.limb_words import limb_words, sentence
 from ..body.motion import BodyFit
 from ..body.skin.contour_skin import SkinSettings, body_skin
 from ..body.skin.extremities import shape_for_skin
@@ -27,6 +28,7 @@ from . import pictures
 from .document import document, figure, notes, table
 from .figures import Row, figure_rows, figures_csv, number, quoted
 from .graphs import SCRIPT, curve_graph
+from .limb_strip import MEANING, limb_strip
 from .overview import LEGEND, body_by_sigma, bone_sigma_mm, strip_frames, verdict, window_px
 from .silhouettes import OUTLINE, PERSON, Silhouettes
 from .trails import trail_pictures
@@ -198,6 +200,15 @@ def _measurement_graphs(report: Report) -> list[str]:
     return graphs
 
 
+def _limbs(body: BodyFit | None) -> str:
+    """In which frames each limb was seen, inferred or guessed."""
+    if body is None:
+        return ""
+    frames, words = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
+    lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
+    return f'<h2>Limbs</h2>{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
+
+
 def _limb_graphs(report: Report) -> dict[str, list[str]]:
     """The degrees of freedom over the frames with a band of one sigma, by limb; dashed: limits of the joint, frames with clicks."""
     body = report.body
@@ -246,6 +257,7 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         f'<p class="soft">{html.escape(facts)}</p>'
         + (f'<div class="row cells">{cells}</div><p class="soft">{LEGEND}</p>' if cells else "")
         + notes(record["warnings"])
+        + _limbs(report.body)
         + f'{shown}<h2>Over time</h2><p class="soft">Point at a curve to read it, drag over a range to enlarge it, double-click to see '
         "all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"
         f"{graphs}{limbs}<h2>All figures</h2>"

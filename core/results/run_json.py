@@ -55,6 +55,11 @@ def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
         counts = entry.get("frames", {}) if stage == "fit" else {}
         if not isinstance(counts, dict) or any(not is_figure(n) for n in counts.values()):
             return stage
+        limbs = entry.get("limbs", {}) if stage == "fit" else {}
+        if not isinstance(limbs, dict) or any(
+            not isinstance(words, dict) or any(not is_figure(n) for n in words.values()) for words in limbs.values()
+        ):
+            return stage
     return None
 
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..body.motion import FITTED, BodyFit
+from ..body.limb_words import FEW_FRAMES, counts, guessed_frames, limb_words
+from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
@@ -92,6 +93,8 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
         "converged": body.converged,
         "sigma0": finite_median(body.motion.sigma0, 0.0),
         "joint_sigma_mm": 1e3 * finite_median(body.motion.joint_sigma_m, 0.0),
+        "joint_frame_sigma_mm": 1e3 * finite_median(body.motion.joint_frame_sigma_m, 0.0),
+        "limbs": counts(limb_words(body.motion.joint_names, body.motion.known)),
     }
     if len(body.outline_m):
         figures["outline_mm"] = 1e3 * finite_median(body.outline_m, 0.0)
@@ -99,7 +102,6 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
 
 
 LIMBS = {"upper_arm": "arm", "forearm": "forearm", "thigh": "leg", "shin": "lower leg"}
-FEW_FRAMES = 5  # that are not worth a warning
 
 
 def start_figures(start: StartJoints) -> dict[str, Any]:
@@ -120,9 +122,18 @@ def frame_states(body: BodyFit) -> dict[str, int]:
 
 
 def fit_warnings(body: BodyFit) -> list[str]:
-    """What is doubtful about the fit as a whole: frames that rest on prediction, an adjustment that did not converge."""
-    predicted = ", ".join(f"{n} {word}" for word, n in frame_states(body).items() if word != FITTED)
-    warnings = [f"Frames in which the body rests partly on prediction: {predicted}."] if predicted else []
+    """What is doubtful about the fit as a whole: frames that rest on prediction, limbs that are guessed or contradicted, an adjustment that
+    did not converge."""
+    motion = body.motion
+    predicted = ", ".join(f"{n} {word}" for word, n in frame_states(body).items() if word not in (FITTED, PARTIAL))
+    warnings = [f"Frames in which the body rests on prediction: {predicted}."] if predicted else []
+    for limb, row in limb_words(motion.joint_names, motion.known).items():
+        frames = guessed_frames(motion.frames.tolist(), row)
+        if len(frames) > FEW_FRAMES:
+            warnings.append(
+                f"The place of the {limb} is guessed in {len(frames)} frames ({frame_list(frames)}), for the images do not show where it "
+                "is: look at it there, and click its joints in one of these frames."
+            )
     for bone, frames in body.contradicted.items():
         if len(frames) > FEW_FRAMES:
             warnings.append(
@@ -234,7 +245,8 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
 
 
 def doubtful_frames(table: FrameTable, body: BodyFit | None) -> dict[int, str]:
-    """Why frames are doubtful, the worst first: those in which the images contradict a limb, then those worse than the median frame.
+    """Why frames are doubtful, the worst first: those in which the images contradict a limb or do not show where it is, then those worse
+    than the median frame.
 
     A state of the fit that most frames share does not single out a frame.
     """
@@ -245,10 +257,21 @@ def doubtful_frames(table: FrameTable, body: BodyFit | None) -> dict[int, str]:
         for frame in frames:
             contradicted.setdefault(int(frame), []).append(limb_name(bone))
     found = {frame: f"the images contradict the {' and the '.join(limbs)}" for frame, limbs in contradicted.items()}
+    for frame, limbs in _guessed(body).items():
+        found.setdefault(frame, f"the {' and the '.join(limbs)} {'are' if len(limbs) > 1 else 'is'} guessed")
     badness, reasons = table.badness()
     for t in np.argsort(-badness, kind="stable").tolist():
         if reasons[t]:
             found.setdefault(int(table.frames[t]), reasons[t])
+    return found
+
+
+def _guessed(body: BodyFit | None) -> dict[int, list[str]]:
+    """The limbs that are guessed, by frame."""
+    found: dict[int, list[str]] = {}
+    for limb, row in limb_words(body.motion.joint_names, body.motion.known).items() if body is not None else ():
+        for frame in guessed_frames(body.motion.frames.tolist(), row) if body is not None else ():
+            found.setdefault(frame, []).append(limb)
     return found
 
 

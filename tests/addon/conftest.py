@@ -159,6 +159,8 @@ def write_result(out: Path, shape: BodyShape, frames: np.ndarray, motion: np.nda
         joint_names=tuple(joints),
         joints_m=np.stack(list(joints.values()), axis=1),
         joint_sigma_m=np.full((len(frames), len(joints)), 1e-3),
+        joint_frame_sigma_m=np.full((len(frames), len(joints)), 1e-3),
+        known=(("seen",) * len(joints),) * len(frames),
         status=("fitted",) * len(frames),
         sigma0=np.ones(len(frames)),
     )

@@ -34,6 +34,15 @@ def widened(parameters: ShapeParameters, area: np.ndarray, covariance: np.ndarra
         covariance *= factor * factor[:, None]
 
 
+def contradicted_joints(parameters: ShapeParameters, area: np.ndarray) -> np.ndarray:
+    """Whether each joint (T, J) belongs to a limb that its area (T, L) contradicts."""
+    skeleton = parameters.skeleton
+    found = np.zeros((len(area), len(skeleton.joint_names)), dtype=bool)
+    for limb, column in zip(whole_limbs(parameters), area.T):
+        found[:, [skeleton.joint_names.index(skeleton.bones[b].tail_joint) for b in limb.outer]] |= column[:, None] > CONTRADICTED
+    return found
+
+
 def contradicted_frames(parameters: ShapeParameters, frames: np.ndarray, area: np.ndarray) -> dict[str, tuple[int, ...]]:
     """By the first bone of each limb the frames (T,) in which it is contradicted, from the areas (T, L); see `BodyFit.contradicted`."""
     names = [parameters.skeleton.bones[limb.bones[0]].name for limb in whole_limbs(parameters)]

@@ -41,10 +41,12 @@ SINGULAR = 1e-9  # of singular values: one view shows no depth
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointPlaces:
-    """Other places of the joints in a body: its shape vector (S,), the shifts (J, 3) [m], and the centres (M, 3) of its metaballs."""
+    """Other places of the joints in a body: its shape vector (S,), the shifts (J, 3) [m] with the sigmas (J,) of a coordinate, and the
+    centres (M, 3) of its metaballs."""
 
     vector: np.ndarray
     shift: np.ndarray
+    sigma_m: np.ndarray
     centre: np.ndarray
 
     def applied(self, fit: FitContext, solution: Solution) -> tuple[FitContext, Solution]:
@@ -89,7 +91,20 @@ def joints_as_clicked(fit: FitContext, motion: np.ndarray, vector: np.ndarray, t
         motion = motion + np.stack([frame.turned(step) for frame in frames])
         vector[lengths] += step[: len(lengths)]
         shift += step[len(lengths) :].reshape(-1, 3)
-    return JointPlaces(vector=vector, shift=shift, centre=_centres_in_place(fit.parameters, before, motion, vector))
+    variance = np.diag(np.linalg.inv(A))[len(lengths) :].reshape(-1, 3)
+    centre = _centres_in_place(fit.parameters, before, motion, vector)
+    return JointPlaces(vector=vector, shift=shift, sigma_m=np.sqrt(variance.mean(axis=1)), centre=centre)
+
+
+def place_sigmas(fit: FitContext) -> np.ndarray:
+    """Sigma (J,) [m] of where a joint lies in its bone, without clicks.  (2)"""
+    return float(np.hypot(COMMON, OWN)) * _thickness(fit)
+
+
+def _thickness(fit: FitContext) -> np.ndarray:
+    """r (J,) [m]."""
+    radius = joint_depths_m(fit.model)
+    return np.array([radius.get(name, NO_FLESH_M) for name in fit.parameters.skeleton.joint_names])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -177,8 +192,7 @@ def _seen(fit: FitContext, motion: np.ndarray, vector: np.ndarray) -> list[_Seen
 
 def _of_shifts(fit: FitContext, seen: Sequence[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix (3J, 3J) and right side (3J,) of the shifts by (1) and (2)."""
-    names, radius = fit.parameters.skeleton.joint_names, joint_depths_m(fit.model)
-    r = np.array([radius.get(name, NO_FLESH_M) for name in names])
+    names, r = fit.parameters.skeleton.joint_names, _thickness(fit)
     sides = np.array([name.removesuffix(".R").removesuffix(".L") for name in names])
     pair = (sides[:, None] == sides) & ~np.eye(len(names), dtype=bool)
     K = np.kron(np.diag((COMMON**2 + OWN**2) * r**2), np.eye(3)) + np.kron(pair * np.outer(COMMON * r, COMMON * r), MIRRORED)

@@ -23,7 +23,8 @@ from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .contradicted import misplaced_limbs, widened
-from .joint_places import JointPlaces, has_both_sides, joints_as_clicked
+from .joint_places import JointPlaces, has_both_sides, joints_as_clicked, place_sigmas
+from .limb_modes import elsewhere, of_joints
 from .pose_tracking import Checkpoints
 
 A = TypeVar("A")
@@ -72,6 +73,11 @@ class Recording:
             return None
         return joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s)
 
+    def place_sigmas(self, solution: Solution, places: JointPlaces | None) -> np.ndarray:
+        """Sigma (J,) [m] of where each joint lies in the body, whether it was moved to its clicks or not."""
+        found = places or joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s)
+        return place_sigmas(self.fit) if found is None else found.sigma_m
+
     def with_places(self, solution: Solution, places: JointPlaces | None) -> tuple["Recording", Solution]:
         """The recording and its solution with the joints in their places, if there are others."""
         if places is None:
@@ -93,6 +99,7 @@ class FrameResults:
     evidence: np.ndarray  # (n, B)
     outline_m: np.ndarray  # (K,)
     misplaced: np.ndarray  # (n, L) area in voxels by which each limb contradicts what is seen (`contradicted`)
+    elsewhere_m2: np.ndarray  # (n, J) variance that the other places of limbs add (`limb_modes`); joint_sigma_m is without it
 
 
 def frame_results(part: Recording, solution: Estimate, covariance: Covariance, frames: range) -> FrameResults:
@@ -103,7 +110,7 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
     joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
     sigma0 = np.array([frame_sigma0(fit, t, points[t], solution) for t in frames])
     counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
-    wrong = []
+    wrong, others = [], elsewhere(fit, points, solution, part.time_s, frames)
     for i, t in enumerate(frames):
         fit.monitor.check()
         state = fit.parameters.state(solution.motion[t], solution.vector)
@@ -114,6 +121,8 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
         counts[1, i] = fit.evidence(t, points[t], state)
         wrong.append(misplaced_limbs(fit, t, points[t], state))
         widened(fit.parameters, wrong[-1], pose[t], joint_sigma[i])
+        for other in others:
+            pose[t][np.ix_(other.limb.columns, other.limb.columns)] += other.covariance[i]
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
     return FrameResults(
         values=solution.motion[frames],
@@ -125,6 +134,7 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
         evidence=counts[1],
         outline_m=np.concatenate(outline),
         misplaced=np.array(wrong),
+        elsewhere_m2=of_joints(others, skeleton, n),
     )
 
 
@@ -219,12 +229,13 @@ class ShapeResult:
     vector: np.ndarray  # (S,)
     covariance: np.ndarray  # (S, S)
     places: JointPlaces | None  # of the joints, by their clicks
+    place_m: np.ndarray  # (J,) sigma of these places
     convergence: Convergence
 
     def save(self, checkpoints: Checkpoints | None) -> None:
         """Store it."""
         if checkpoints is not None:
-            arrays = {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance}
+            arrays = {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance, "place_m": self.place_m}
             arrays |= _table("places", self.places) if self.places is not None else {}
             checkpoints.save("shape_of_blocks", {**arrays, **self.convergence.arrays()})
 
@@ -239,6 +250,7 @@ class ShapeResult:
             vector=found["vector"],
             covariance=found["covariance"],
             places=_value(JointPlaces, "places", found) if "places.vector" in found else None,
+            place_m=found["place_m"],
             convergence=Convergence.loaded(found),
         )
 

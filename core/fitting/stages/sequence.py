@@ -42,7 +42,7 @@ from ..solve.solver import Solution, solve
 from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import ALTERNATION_STEPS, clicked_lengths, fit_click_frame
-from .contradicted import contradicted_frames
+from .contradicted import contradicted_frames, contradicted_joints
 from .inverse_kinematics import shared_over_time
 from .limb_paths import follow_limbs
 from .long_sequence import (
@@ -65,6 +65,7 @@ from .long_sequence import (
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
 from .set_up import fit_context, with_start
+from .sigma_parts import known, sigma_parts
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
 
@@ -133,9 +134,11 @@ def _at_once(whole: Recording, start: Estimate, monitor: Monitor) -> BodyFit:
     monitor.step(SIGMAS, 1, 3)
     covariance = _covariance(problem, solution, factors)
     monitor.step(SIGMAS, 2, 3)
-    part, solution = part.with_places(solution, part.places(solution))
+    places = part.places(solution)
+    place_m = part.place_sigmas(solution, places)
+    part, solution = part.with_places(solution, places)
     results = frame_results(part, solution, covariance, frames)
-    return _result(part, results, solution.vector, covariance[2], [Convergence.of(solution)])
+    return _result(part, results, solution.vector, covariance[2], place_m, [Convergence.of(solution)])
 
 
 def _adjusted(part: Recording, start: Estimate, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
@@ -185,7 +188,7 @@ def _in_stretches(whole: Recording, start: Estimate, monitor: Monitor, checkpoin
     if shape.places is not None:
         whole = replace(whole, fit=shape.places.placed(whole.fit))
     vector = shape.vector if shape.places is None else shape.places.vector
-    return _result(whole, results, vector, shape.covariance, [shape.convergence, *convergence])
+    return _result(whole, results, vector, shape.covariance, shape.place_m, [shape.convergence, *convergence])
 
 
 def _shape_of_blocks(whole: Recording, start: Estimate, monitor: Monitor) -> ShapeResult:
@@ -194,12 +197,13 @@ def _shape_of_blocks(whole: Recording, start: Estimate, monitor: Monitor) -> Sha
     blocks = whole.stretch(frames, start.motion, start.vector)
     part, problem, solutions = _adjusted(blocks, replace(start, motion=start.motion[frames]), monitor)
     last = solutions[-1]
-    covariance = _covariance(problem, last, _factors(part, problem, last))[2]
+    covariance, places = _covariance(problem, last, _factors(part, problem, last))[2], part.places(last)
     return ShapeResult(
         simplified=solutions[0].vector,
         vector=last.vector,
         covariance=covariance,
-        places=part.places(last),
+        places=places,
+        place_m=part.place_sigmas(last, places),
         convergence=Convergence.of(last),
     )
 
@@ -334,10 +338,17 @@ def _restarted(part: Recording, solution: Solution, problem: Problem, monitor: M
 
 
 def _result(
-    whole: Recording, results: FrameResults, vector: np.ndarray, covariance: np.ndarray, convergence: Sequence[Convergence]
+    whole: Recording,
+    results: FrameResults,
+    vector: np.ndarray,
+    covariance: np.ndarray,
+    place_m: np.ndarray,
+    convergence: Sequence[Convergence],
 ) -> BodyFit:
-    """The body of all frames, with the shape vector (S,) and its covariance (S, S)."""
+    """The body of all frames, with the shape vector (S,) and its covariance (S, S), and the sigmas of the joints' places (J,)."""
     fit, skeleton = whole.fit, whole.fit.model.skeleton
+    lengths, observed = fit.parameters.body(vector)[0], (results.evidence >= fit.few_points) | ~free_bones(fit.parameters)
+    sigmas = sigma_parts(skeleton, lengths, results.values, results.joint_sigma_m, results.elsewhere_m2, place_m)
     vector, covariance = smooth_radii(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
     motion = BodyMotion(
         frames=np.array(whole.frames),
@@ -347,7 +358,9 @@ def _result(
         covariance=results.covariance,
         joint_names=skeleton.joint_names,
         joints_m=results.joints_m,
-        joint_sigma_m=results.joint_sigma_m,
+        joint_sigma_m=sigmas.total_m,
+        joint_frame_sigma_m=sigmas.frame_m,
+        known=known(skeleton, observed, contradicted_joints(fit.parameters, results.misplaced), sigmas.frame_m),
         status=_statuses(fit, results.evidence, results.sigma0),
         sigma0=results.sigma0,
     )

@@ -40,6 +40,7 @@ class Markers:
     frames: np.ndarray  # (T,) integer frame numbers
     xyz_m: np.ndarray  # (T, N, 3) world
     sigma_m: np.ndarray  # (T, N); NaN: unknown
+    known: tuple[tuple[str, ...], ...] = ()  # (T, N) how well each point is known, in words: seen, inferred, guessed; empty: not said
 
     def __post_init__(self) -> None:
         t, n = len(self.frames), len(self.names)
@@ -118,15 +119,16 @@ def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: 
         InputError: axes or unit are not known, or the file cannot be written.
     """
     per_unit = metres_per(unit, path)
-    rows = ["frame,time_s,joint,x,y,z,sigma"]
-    for frame, places, sigmas in zip(markers.frames, markers.xyz_m @ axes_of(axes).T / per_unit, markers.sigma_m / per_unit):
-        for name, X, sigma in zip(markers.names, places, sigmas):
+    rows = ["frame,time_s,joint,x,y,z,sigma" + (",known" if markers.known else "")]
+    words = markers.known or (("",) * len(markers.names),) * len(markers.frames)
+    for frame, places, sigmas, row in zip(markers.frames, markers.xyz_m @ axes_of(axes).T / per_unit, markers.sigma_m / per_unit, words):
+        for name, X, sigma, word in zip(markers.names, places, sigmas, row):
             if np.isfinite(X).all():
                 text = io.StringIO()
                 csv.writer(text, lineterminator="").writerow([name])
                 rows.append(
                     f"{frame},{frame_time_s(frame, markers.fps):.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
-                    f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}"
+                    f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}{f',{word}' if markers.known else ''}"
                 )
     store.write_text(Path(path), "\n".join(rows) + "\n")
 

@@ -20,6 +20,7 @@ from tricap.core.fitting.solve.problem import Scales
 from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.contradicted import ANYWHERE_M, CONTRADICTED, widened
 from tricap.core.fitting.stages.hidden_limbs import reacquired_poses
+from tricap.core.fitting.stages.limb_modes import elsewhere, of_joints
 from tricap.core.fitting.stages.limb_paths import follow_limbs
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
@@ -177,3 +178,19 @@ def test_a_contradicted_limb_is_not_certain(fit) -> None:
     assert np.linalg.eigvalsh(covariance).min() > 0
     layout = SHAPE.skeleton.layout
     assert np.sqrt(covariance[layout["elbow.R flexion"]] * 1.0).max() > 0.5 > np.sqrt(covariance[layout["elbow.L flexion"]]).max()
+
+
+def test_a_limb_that_explains_less_than_it_could_may_be_elsewhere(fit) -> None:
+    """Where the silhouettes show the arm it has no other place of any weight; left where it was, it has; unseen, it may be anywhere."""
+    bare, vector, time_s = fit_context(_given(FRAMES, []), FitSettings()), _vector(fit), np.arange(FRAMES) / 30
+    sigmas = []
+    for context, motion in ((fit, POSES), (fit, np.tile(BEFORE, (FRAMES, 1))), (bare, POSES)):
+        at = Solution(motion=motion, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
+        found = elsewhere(context, [NOTHING] * FRAMES, at, time_s, range(3, FRAMES))
+        variance = of_joints(found, SHAPE.skeleton, FRAMES - 3)
+        sigmas.append(dict(zip(SHAPE.skeleton.joint_names, np.sqrt(variance[-1]))))
+        assert all(np.linalg.eigvalsh(one.covariance).min() > -1e-12 for one in found)
+    right, left_behind, unseen = sigmas
+    assert right["wrist.R"] < 0.07  # 0.056 across the depth, which three outlines leave open
+    assert left_behind["wrist.R"] > 2 * right["wrist.R"] and unseen["wrist.R"] > 3 * right["wrist.R"]
+    assert right["pelvis"] == right["shoulder.R"] == 0.0 and right["elbow.R"] <= right["wrist.R"] + 0.01

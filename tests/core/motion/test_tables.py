@@ -27,6 +27,8 @@ def _motion() -> BodyMotion:
         joint_names=tuple(joints),
         joints_m=np.stack(list(joints.values()), axis=1),
         joint_sigma_m=np.full((4, 3), 0.002),
+        joint_frame_sigma_m=np.full((4, 3), 0.001),
+        known=(("seen", "inferred", "guessed"),) * 3 + (("seen",) * 3,),
         status=("fitted", "partial", "bridged", "suspect"),
         sigma0=np.ones(4),
     )
@@ -57,6 +59,20 @@ def test_joints_come_back_by_name_and_frame(tmp_path: Path) -> None:
     assert table.frames.tolist() == [3, 4, 6, 7]
     assert np.allclose(table.joints_m["wrist.R"], motion.joints_m[:, 2], atol=1e-6)
     assert np.allclose(table.sigma_m["elbow.R"], 0.002)
+    assert np.allclose(table.frame_sigma_m["elbow.R"], 0.001)
+    assert table.known["wrist.R"] == ("guessed", "guessed", "guessed", "seen")
+
+
+def test_joints_of_an_earlier_version_lack_the_later_columns(tmp_path: Path) -> None:
+    path = tmp_path / "joints.csv"
+    write_joints(path, _motion())
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line.rsplit(",", 2)[0] for line in lines) + "\n")
+    table = read_joints(path)
+    assert np.isnan(table.frame_sigma_m["elbow.R"]).all() and set(table.known["wrist.R"]) == {""}
+    path.write_text("\n".join([lines[0], lines[1].replace("seen", "maybe")]) + "\n")
+    with pytest.raises(InputError, match="“maybe” for “known”"):
+        read_joints(path)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from tricap.core.foundation import store
 from tricap.core.report.document import STYLE, document, figure, notes, table
 from tricap.core.report.figures import figures_csv
 from tricap.core.report.graphs import SCRIPT, curve_graph
+from tricap.core.report.limb_strip import limb_strip
 from tricap.core.report.overview import CELL_PX, body_by_sigma, bone_sigma_mm, sigma_colours, strip_frames, verdict
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.pictures import jpeg
@@ -56,7 +57,8 @@ def fitted(**changes: Any) -> BodyFit:
     motion = BodyMotion(
         frames=np.arange(3), time_s=np.arange(3) / 25, dof_names=ARM.skeleton.dof_names, values=values,
         covariance=np.tile(np.eye(d) * 1e-4, (3, 1, 1)), joint_names=ARM.skeleton.joint_names,
-        joints_m=np.zeros((3, j, 3)) + [0.15, 0.0, 2.6], joint_sigma_m=sigma, status=("fitted", "fitted", "partial"), sigma0=np.ones(3),
+        joints_m=np.zeros((3, j, 3)) + [0.15, 0.0, 2.6], joint_sigma_m=sigma, joint_frame_sigma_m=sigma, known=(("seen",) * j,) * 3,
+        status=("fitted", "fitted", "partial"), sigma0=np.ones(3),
     )  # fmt: skip
     given = dict(shape=ARM, motion=motion, iterations=3, converged=True, points=np.zeros((3, 2)), outline_m=np.zeros(0))
     return BodyFit(**{**given, **changes})  # type: ignore[arg-type]
@@ -91,6 +93,12 @@ def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
     assert redness.min() < -10 and redness.max() > 60 and (redness == 0).mean() > 0.4
     aside = body_by_sigma(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), np.array([900.0, -400.0]), 90.0)
     assert aside.shape == (CELL_PX, CELL_PX, 3)
+
+
+def test_the_strip_of_limbs_names_runs_of_frames() -> None:
+    strip = limb_strip([4, 5, 6], {"left arm": ("seen", "guessed", "guessed"), "<leg>": ("seen",) * 3})
+    assert strip.count("<title>") == 3 and "left arm: guessed in frames 5 to 6" in strip and "left arm: seen in frame 4" in strip
+    assert "&lt;leg&gt;" in strip and "<leg>" not in strip and limb_strip([], {}) == ""
 
 
 def test_frames_of_the_strip() -> None:

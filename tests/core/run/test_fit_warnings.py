@@ -3,19 +3,29 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from tricap.core.run.record import FEW_FRAMES, fit_warnings, frame_list, limb_name
+from tricap.core.body.limb_words import FEW_FRAMES
+from tricap.core.run.record import fit_warnings, frame_list, limb_name
 
 
-def _body(contradicted: dict[str, tuple[int, ...]]) -> Any:
-    return SimpleNamespace(motion=SimpleNamespace(status=("fitted",) * 30), converged=True, iterations=3, contradicted=contradicted)
+def _body(contradicted: dict[str, tuple[int, ...]], known: tuple[tuple[str, ...], ...] = (("seen", "seen"),) * 30) -> Any:
+    motion = SimpleNamespace(status=("fitted",) * 30, frames=np.arange(30), joint_names=("elbow.L", "wrist.L"), known=known)
+    return SimpleNamespace(motion=motion, converged=True, iterations=3, contradicted=contradicted)
 
 
 def test_a_limb_that_the_images_contradict_is_named_with_its_frames() -> None:
     (warning,) = fit_warnings(_body({"upper_arm.R": (3, 7, 8, 9, 12, 13), "thigh.L": tuple(range(FEW_FRAMES))}))
     assert "the right arm in 6 frames (3, 7–9, 12–13)" in warning and "click its joints" in warning
     assert fit_warnings(_body({})) == []
+
+
+def test_a_limb_that_is_guessed_is_named_with_its_frames() -> None:
+    rows = lambda n: (("seen", "guessed"),) * n + (("inferred", "seen"),) * (30 - n)  # noqa: E731
+    (warning,) = fit_warnings(_body({}, rows(FEW_FRAMES + 1)))
+    assert f"The place of the left arm is guessed in {FEW_FRAMES + 1} frames (0–{FEW_FRAMES})" in warning
+    assert fit_warnings(_body({}, rows(FEW_FRAMES))) == []
 
 
 @pytest.mark.parametrize(("bone", "words"), [("upper_arm.L", "left arm"), ("thigh.R", "right leg"), ("tail_tip", "tail tip")])

@@ -77,6 +77,8 @@ def test_doubtful_frames() -> None:
     states = FrameTable(frames=frames, values=values, fit=("partial", "partial", "partial", "bridged", "partial"))
     assert doubtful_frames(states, None) == {12: "points uncertain", 13: "fit bridged", 14: "points uncertain"}
     assert doubtful_stretches(states) == [(12, 14, "points uncertain")]
-    body: Any = SimpleNamespace(contradicted={"upper_arm.R": (11, 12), "shin.L": (12,)})
+    motion = SimpleNamespace(frames=frames, joint_names=("wrist.R",), known=(("guessed",), *((("seen",),) * 4)))
+    body: Any = SimpleNamespace(contradicted={"upper_arm.R": (11, 12), "shin.L": (12,)}, motion=motion)
     found = doubtful_frames(states, body)
-    assert list(found) == [11, 12, 13, 14] and found[12] == "the images contradict the right arm and the left lower leg"
+    assert list(found) == [11, 12, 10, 13, 14] and found[10] == "the right arm is guessed"
+    assert found[12] == "the images contradict the right arm and the left lower leg"
