@@ -29,6 +29,7 @@ from .scene import clips
 from .session import get_session
 
 ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
+SAME_RATE = 1e-3  # relative difference of the images per second that does not show
 OTHER_FIELDS = "The footage does not show the chosen fields. Press Reload Footage."
 CHANGED_OUTSIDE = "take.toml was changed outside Blender. Reload Take uses these changes, Overwrite Take discards them."
 
@@ -134,6 +135,21 @@ def shows_other_fields(scene: bpy.types.Scene) -> bool:
     """Whether the clips show whole images where fields are chosen, or the reverse: their frame numbers differ."""
     wanted = _first_field(scene)
     return any(view.clip is not None and view.clip.get(clips.FIELDS_KEY, "") != wanted for view in scene.tricap.views)
+
+
+def check_rates(scene: bpy.types.Scene) -> None:
+    """Refuse clicks in views of which Blender cannot show the image of every frame.
+
+    Raises:
+        InputError: a view has its own images per second, or time stamps.
+    """
+    rate = scene.tricap.fps
+    for view in scene.tricap.views:
+        if view.timestamps or (view.fps and abs(view.fps / rate - 1) > SAME_RATE):
+            raise InputError(
+                f"View {view.name} does not have {rate:g} images per second like the take, and Blender would show it at other moments "
+                "than the other views. Start without clicks, or write them into take.toml."
+            )
 
 
 def show_fields(scene: bpy.types.Scene) -> None:
@@ -277,7 +293,8 @@ def show_views(
         view.clip[clips.FIELDS_KEY] = _first_field(scene)
         view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
-        view.offset_frames = entry.get("offset_frames", 0)
+        view.fps, view.drift_ppm, view.timestamps = entry.get("fps", 0.0), entry.get("drift_ppm", 0.0), entry.get("timestamps", "")
+        view.start_s, view.offset_frames = entry.get("start", 0.0), entry.get("offset_frames", 0)
         view.person = next((key for key in PERSON_SOURCES if key in entry), "")
         view.person_files = entry.get(view.person, "")
 
@@ -321,6 +338,8 @@ def _show_model(scene: bpy.types.Scene, name: str) -> None:
 def view_entry(view: Any) -> Table:
     """The entry of a view in [[views]]."""
     entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
+    entry |= {"fps": properties.exact(view.fps), "start": properties.exact(view.start_s)}
+    entry |= {"drift_ppm": properties.exact(view.drift_ppm), "timestamps": view.timestamps}
     if view.person:
         entry[view.person] = view.person_files
     return {key: value for key, value in entry.items() if value or key == "name"}

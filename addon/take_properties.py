@@ -44,7 +44,8 @@ def _renamed(view: Any, _: bpy.types.Context) -> None:
 
 def _shifted(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
-        view.clip.frame_start = -frames_per_image(view.clip) * view.offset_frames
+        rate = view.fps or (view.id_data.tricap.fps if view.id_data else 0.0)
+        view.clip.frame_start = frames_per_image(view.clip) * (round(view.start_s * rate) - view.offset_frames)
     notify_change(view, _)
 
 
@@ -66,6 +67,24 @@ class View(bpy.types.PropertyGroup):
         update=_shifted,  # type: ignore[valid-type]
         description="Frame offset of this camera relative to the others; positive if it started recording earlier",
     )
+    fps: bpy.props.FloatProperty(
+        name="FPS of View",
+        min=0.0,
+        max=10_000.0,
+        precision=3,
+        update=_shifted,  # type: ignore[valid-type]
+        description="Images per second of this camera. 0: those of the other cameras",
+    )
+    start_s: bpy.props.FloatProperty(
+        name="Start",
+        precision=4,
+        soft_min=-600.0,
+        soft_max=600.0,
+        update=_shifted,  # type: ignore[valid-type]
+        description="When this camera took its first image, in seconds after the beginning of the take; Synchronise finds it",
+    )
+    drift_ppm: bpy.props.FloatProperty(name="Drift", options={"HIDDEN"})  # type: ignore[valid-type]
+    timestamps: bpy.props.StringProperty(name="Time Stamps", options={"HIDDEN"})  # type: ignore[valid-type]
 
 
 def annotations() -> dict[str, Any]:

@@ -39,6 +39,7 @@ class OpenViews(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Go to the workspace, created if needed, and lay out the views once Blender shows it."""
         try:
+            project.check_rates(context.scene)
             clips = list(project.clips_of(context.scene).values())[:MOST_VIEWS]
         except InputError as error:
             self.report({"ERROR"}, str(error))

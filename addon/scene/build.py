@@ -24,6 +24,7 @@ from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
+from ...core.take.footage import Footage
 from . import action, armature, cameras, clips, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
@@ -31,6 +32,7 @@ from .rest_pose import with_rest_pose
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
+SAME_RATE = 1e-3  # relative difference of the images per second that does not show
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
@@ -284,17 +286,27 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
     reference = footage.rig.cameras[take.reference]
     cameras.frame_render(scene, reference)
     warnings += cameras.frame_faults(footage.rig, reference)
-    for view, camera, (clip, files) in zip(take.views, footage.rig.cameras, opened):
+    for k, (view, camera, (clip, files)) in enumerate(zip(take.views, footage.rig.cameras, opened)):
         camera_object = cameras.add_camera(collection, camera)
         camera_object["tricap_interlaced"] = take.interlaced
         if clip.name.startswith(name := f"Footage {view.name}"):
             clip.name = name  # until now the clip of an earlier build had it
-        clip.frame_start = -take.field_layout.per_image * view.offset_frames
+        clip.frame_start = _first_frame(footage, k)
+        if footage.clocks and abs(footage.interval_frames(k) / take.field_layout.per_image - 1) > SAME_RATE:
+            warnings.append(f"View {view.name} has its own images per second: Blender shows its footage at the rate of the take.")
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
         if camera is reference:
             scene.camera, scene.active_clip = camera_object, clip
     return len(take.views)
+
+
+def _first_frame(footage: Footage, view: int) -> int:
+    """The scene's frame that shows the first image of a view."""
+    per = footage.take.field_layout.per_image
+    if footage.clocks:
+        return per * round(footage.clocks[view].time_s(0) * footage.take.fps / per)
+    return -per * footage.take.views[view].offset_frames
 
 
 def _add_bar(collection: bpy.types.Collection, first: int, frames: np.ndarray, ends_m: np.ndarray) -> int:

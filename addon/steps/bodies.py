@@ -56,6 +56,10 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     side.operator("tricap.remove_view", text="", icon="REMOVE")
     side.operator("tricap.move_view", text="", icon="TRIA_UP").up = True
     side.operator("tricap.move_view", text="", icon="TRIA_DOWN").up = False
+    if 0 <= props.view_index < len(props.views):
+        pair = layout.column(align=True)
+        pair.prop(props.views[props.view_index], "fps")
+        pair.prop(props.views[props.view_index], "start_s")
     draw_person(layout, context)
     _draw_fixes(layout, context, is_next)
     layout.prop(props, "fps")

@@ -313,6 +313,9 @@ def use_common_frames(scene: bpy.types.Scene, folder: Path) -> None:
     Raises:
         InputError: there are none.
     """
+    if any(view.has_clock for view in project.take(scene).views):
+        scene.tricap.all_frames = True  # which are those that all views show
+        return
     spans = _spans(scene, folder)
     first, stop = max(0, *(a for a, _ in spans)), min(b for _, b in spans)
     if stop <= first:

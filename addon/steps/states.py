@@ -158,7 +158,7 @@ def _footage(scene: bpy.types.Scene, found: _Project) -> State:
     take = project.take(scene)
     found.sequences = tuple(_sequence(folder, view) for view in take.views)
     spans = [(-view.offset_frames, s.count - view.offset_frames) for view, s in zip(take.views, found.sequences)]
-    if take.frames is None and len({stop for _, stop in spans}) > 1:
+    if take.frames is None and len({stop for _, stop in spans}) > 1 and not any(view.has_clock for view in take.views):
         ends = ", ".join(f"{view.name} ends with frame {stop - 1}" for view, (_, stop) in zip(take.views, spans))
         raise FixableError(f"The views differ in length: {ends}. Press Use Common Frames, or correct the offsets.", Fix.COMMON_FRAMES)
     try:

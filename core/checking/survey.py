@@ -29,7 +29,7 @@ class Survey:
     """Figures (V, T) of V views in T consecutive frames."""
 
     frames: range
-    energy: np.ndarray  # motion energy: mean grey difference from the frame before, NaN in the first
+    energy: np.ndarray  # motion energy: mean grey difference from the frame before, NaN in the first and where it is the same image
     spread: np.ndarray  # standard deviation of the grey values
     bright: np.ndarray  # 98th percentile of the grey values
     white: np.ndarray  # share of overexposed pixels
@@ -52,7 +52,8 @@ def survey(footage: Footage, monitor: Monitor) -> Survey:
         images = [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
         small = [_reduced(image) for image in images]
         for k, image in enumerate(images):
-            energy = float(np.abs(small[k] - before[k]).mean()) if before else np.nan
+            same = before and footage.number(k, frame) == footage.number(k, frames[t - 1])  # of a view with fewer images per second
+            energy = float(np.abs(small[k] - before[k]).mean()) if before and not same else np.nan
             figures[:, k, t] = energy, small[k].std(), np.percentile(small[k], BRIGHT_PERCENTILE), (image[::4, ::4] >= WHITE).mean()
         before = small
     return Survey(frames=frames, energy=figures[0], spread=figures[1], bright=figures[2], white=figures[3])
@@ -98,7 +99,7 @@ def rate_findings(footage: Footage) -> list[Finding]:
     findings = []
     for k, (view, sequence) in enumerate(zip(footage.take.views, footage.sequences)):
         movie = sequence.behind if isinstance(sequence, Recent) else sequence
-        if not isinstance(movie, Movie):
+        if not isinstance(movie, Movie) or view.timestamps is not None:
             continue
         beginning = min(BEGINNING, footage.number(k, footage.frames.stop - 1) + 1)
         if movie.shown < beginning:
@@ -106,7 +107,7 @@ def rate_findings(footage: Footage) -> list[Finding]:
         uneven = movie.unevenness
         if uneven > UNEVEN:
             sentence = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
-            advice = "Convert the movie to a constant frame rate that keeps each frame at its own moment."
+            advice = "Give the view the `timestamps` of its images in take.toml, or convert the movie to a constant frame rate."
             findings.append(wrong(Cause.VARIABLE_FRAME_RATE, sentence, advice, uneven_frames=uneven))
     return findings
 

@@ -369,7 +369,8 @@ def frozen_views(footage: Footage, frame: int, images: list[np.ndarray]) -> list
     after = [f for f in (frame + n * step for n in range(1, FROZEN_FRAMES)) if f in footage.frames]
     same = np.ones(len(names), dtype=bool)
     for f in after:
-        same &= [np.array_equal(a, b) for a, b in zip(images, footage.read(f))]
+        repeats = [footage.number(k, f) == footage.number(k, frame) for k in range(len(names))]  # of a view with fewer images per second
+        same &= [np.array_equal(a, b) and not again for a, b, again in zip(images, footage.read(f), repeats)]
     return [name for name, frozen in zip(names, same) if frozen] if len(after) == FROZEN_FRAMES - 1 and not same.all() else []
 
 

@@ -8,7 +8,8 @@
 
 A point matched between the reference at t and view k at t + L is tracked in view k to the frames before and after; (2) is its signed
 distance from the epipolar line as if view k had been exposed s frames later. Static points, and points that move along the line,
-constrain b but not s. The sigma of the offset comes from the adjustment (3).
+constrain b but not s. The sigma of the offset comes from the adjustment (3). Where the views have clocks (`take.clock`), s starts from
+what they predict for each frame, L counts images of view k, and the offset is what is left.
 
 Where no moving points can be tracked, (1) alone may give whole frames: for views whose axes are not too far apart, because the same motion
 has another rhythm from another side, and only where L correlates better than 0 by several sigmas (5). One rise and fall of the energy is
@@ -67,7 +68,7 @@ class TimeOffset:
     """A view's time offset: its images are exposed `delay_frames` frame intervals after those of the reference. NaN: not known."""
 
     view: str
-    delay_frames: float
+    delay_frames: float  # of the take, in excess of the view's clock if it has one
     sigma_frames: float
     method: str  # one of METHODS, the least exact in the chain to the reference view
     moving: int = 0  # matches that move across the epipolar lines and fit
@@ -168,8 +169,8 @@ def synchronised(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str,
                 f"View {o.view} has a time offset of {o.delay_frames:+.2f} frames, too large to correct; add {-round(o.delay_frames):+d} "
                 "to its `offset_frames` in take.toml, the rest is corrected then."
             )
-    delays = tuple(round(o.delay_frames, 4) if o.significant else 0.0 for o in offsets)
-    sequences = tuple(Recent(s) if t else s for s, t in zip(footage.sequences, delays))
+    delays = tuple(round(o.delay_frames / footage.single().interval_frames(k), 4) if o.significant else 0.0 for k, o in enumerate(offsets))
+    sequences = tuple(Recent(s) if t and not isinstance(s, Recent) else s for s, t in zip(footage.sequences, delays))
     return replace(footage, sequences=sequences, delay_images=delays), {o.view: o.to_table() for o in offsets}
 
 
@@ -182,22 +183,25 @@ class Film:
         self._pictures: dict[tuple[int, int], np.ndarray] = {}
         self._features: dict[tuple[int, int], Features] = {}
 
-    def has(self, k: int, frame: int) -> bool:
-        """Whether view k has an image of that frame of the take."""
-        return 0 <= self.footage.number(k, frame) < self.footage.sequences[k].count
+    def has(self, k: int, number: int) -> bool:
+        """Whether view k has an image of that number."""
+        return 0 <= number < self.footage.sequences[k].count
 
-    def picture(self, k: int, frame: int) -> np.ndarray:
-        """The measured rows (h, w) uint8 of view k."""
-        if (k, frame) not in self._pictures:
-            image = self.footage.sequences[k].read(self.footage.number(k, frame))
-            self._pictures[k, frame] = eight_bits(self.rows.rows(image))
-        return self._pictures[k, frame]
+    def picture(self, k: int, number: int) -> np.ndarray:
+        """The measured rows (h, w) uint8 of an image of view k."""
+        if (k, number) not in self._pictures:
+            self._pictures[k, number] = eight_bits(self.rows.rows(self.footage.sequences[k].read(number)))
+        return self._pictures[k, number]
 
-    def features(self, k: int, frame: int) -> Features:
-        """The keypoints of view k."""
-        if (k, frame) not in self._features:
-            self._features[k, frame] = find_features(self.picture(k, frame))
-        return self._features[k, frame]
+    def features(self, k: int, number: int) -> Features:
+        """The keypoints of an image of view k."""
+        if (k, number) not in self._features:
+            self._features[k, number] = find_features(self.picture(k, number))
+        return self._features[k, number]
+
+    def of_frame(self, k: int, frame: int) -> Features:
+        """The keypoints of view k in a frame of the take."""
+        return self.features(k, self.footage.number(k, frame))
 
     def frames(self) -> list[int]:
         """The frames with most motion, some distance apart, in temporal order; none if there are fewer than three."""
@@ -214,23 +218,24 @@ class Film:
         """A view that is known and one that is not, with most in common in the middle frame."""
         frame = self.survey.frames[len(self.survey.frames) // 2]
         links = [(i, k) for i in sorted(known) for k in range(len(self.cameras)) if k not in known]
-        return max(links, key=lambda link: len(match_pair(self.features(link[0], frame), self.features(link[1], frame))[0]))
+        return max(links, key=lambda link: len(match_pair(self.of_frame(link[0], frame), self.of_frame(link[1], frame))[0]))
 
     def matches(self) -> list[PairMatches]:
         """Matches of every pair of views, in the first, the middle and the last frame of `frames`."""
         chosen = self.frames() or [self.survey.frames[0]]
         chosen = sorted({chosen[0], chosen[len(chosen) // 2], chosen[-1]})
-        return match_features([[self.features(k, f) for k in range(len(self.cameras))] for f in chosen], self.rows)
+        return match_features([[self.of_frame(k, f) for k in range(len(self.cameras))] for f in chosen], self.rows)
 
 
 def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> TimeOffset:
     """The offset of view k against view `base`: the whole frames at which most moving matches fit, and the rest by (3)."""
     lags, correlation = energy_lags(film.survey.energy[base], film.survey.energy[k])
+    interval = film.footage.interval_frames(k)
     best: TimeOffset | None = None
-    for n, lag in enumerate(dict.fromkeys([0, *lags])):
+    for n, lag in enumerate(dict.fromkeys([0, *(round(lag / interval) for lag in lags)])):
         monitor.step("synchronization", n, len(lags) + 1)
         tracked = [m for f in film.frames() if (m := _track_matches(film, base, k, f, lag)) is not None]
-        offset = _fit(tracked, lag, name) if tracked else None
+        offset = _fit(tracked, lag, name, interval) if tracked else None
         if offset is not None and (best is None or offset.moving > BETTER * best.moving):
             best = offset
         if lag == 0 and best is not None and abs(best.delay_frames) < CLEAR:
@@ -280,25 +285,28 @@ class _Tracked:
     """Matches of one frame, tracked in the second view to the frames before and after."""
 
     matches: PairMatches
-    distances: np.ndarray  # (m, 4) e_−, e_0, e_+ in full-frame pixels, and y/h − ½
+    distances: np.ndarray  # (m, 5) e_−, e_0, e_+ in full-frame pixels, y/h − ½, and s as the clocks predict it
 
 
 def _track_matches(film: Film, base: int, k: int, frame: int, lag: int) -> _Tracked | None:
-    """The matches of one frame that can be tracked; None without matches."""
-    if not film.has(base, frame) or not all(film.has(k, frame + lag + step) for step in (-1, 0, 1)):
+    """The matches of one frame that can be tracked in view k, `lag` images later; None without matches."""
+    shown, number = film.footage.number(base, frame), film.footage.number(k, frame) + lag
+    if not film.has(base, shown) or not all(film.has(k, number + step) for step in (-1, 0, 1)):
         return None
-    a, b = film.features(base, frame), film.features(k, frame + lag)
+    a, b = film.features(base, shown), film.features(k, number)
     i, j = match_pair(a, b)
     if not len(i):
         return None
-    here = film.picture(k, frame + lag)
-    xy = [_flow(here, film.picture(k, frame + lag + step), b.xy[j]) if step else b.xy[j] for step in (-1, 0, 1)]
+    here = film.picture(k, number)
+    xy = [_flow(here, film.picture(k, number + step), b.xy[j]) if step else b.xy[j] for step in (-1, 0, 1)]
     good = np.isfinite(np.stack(xy)).all(axis=(0, 2))
     xa = film.rows.to_frame(a.xy[i[good]])
     ca, cb = film.cameras[base], film.cameras[k]
     xb = film.rows.to_frame(xy[1][good])
     y = xb[:, 1] / cb.size_px[1] - 0.5
-    distances = np.stack([*(epipolar_distance_px(ca, cb, xa, film.rows.to_frame(at[good])) for at in xy), y], axis=1)
+    predicted = film.footage.delay(base, frame) * film.footage.interval_frames(base) / film.footage.interval_frames(k)
+    predicted -= film.footage.delay(k, frame)
+    distances = np.stack([*(epipolar_distance_px(ca, cb, xa, film.rows.to_frame(at[good])) for at in xy), y, predicted + 0 * y], axis=1)
     return _Tracked(matches=PairMatches(i=base, j=k, xi_px=xa, xj_px=xb), distances=distances)
 
 
@@ -312,13 +320,15 @@ def _flow(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return np.where(good[:, None], end.reshape(-1, 2).astype(np.float64), np.nan)
 
 
-def _fit(tracked: list[_Tracked], lag: int, name: str) -> TimeOffset | None:
-    """The offset from the matches of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
+def _fit(tracked: list[_Tracked], lag: int, name: str, interval: float = 1.0) -> TimeOffset | None:
+    """The offset from the matches of some frames, at a lag in whole images that are `interval` frames of the take apart, or None where too
+    few moving matches fit.  (3)"""
     e = np.concatenate([m.distances for m in tracked])
     rate, curvature = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2
 
     def distance(s: float) -> np.ndarray:
-        return np.asarray(e[:, 1] + s * rate + s * s * curvature)  # (2)
+        at = e[:, 4] + s
+        return np.asarray(e[:, 1] + at * rate + at * at * curvature)  # (2)
 
     moving = np.abs(rate) > MOVES_PX
     if moving.sum() < FEWEST_MOVING:
@@ -328,7 +338,7 @@ def _fit(tracked: list[_Tracked], lag: int, name: str) -> TimeOffset | None:
     for _ in range(STEPS):
         v = distance(s) - b
         w = 1 / (1 + (v / SCALE_PX) ** 2)
-        A = np.stack([rate + 2 * s * curvature, -np.ones_like(rate)], axis=1)
+        A = np.stack([rate + 2 * (e[:, 4] + s) * curvature, -np.ones_like(rate)], axis=1)
         normal = (A * w[:, None]).T @ A
         if np.linalg.cond(normal) > SINGULAR:
             return None
@@ -343,14 +353,14 @@ def _fit(tracked: list[_Tracked], lag: int, name: str) -> TimeOffset | None:
     inliers, by = _inliers(tracked), s if abs(s) > max(LEAST_OFFSET, SIGNIFICANT * sigma) else 0.0
     return TimeOffset(
         view=name,
-        delay_frames=-(lag + s),
-        sigma_frames=sigma,
+        delay_frames=-(lag + s) * interval,
+        sigma_frames=sigma * interval,
         method="rays",
         moving=int(good.sum()),
-        speed_px=float(np.percentile(np.abs(rate[good]), SPEED_PERCENTILE)),
+        speed_px=float(np.percentile(np.abs(rate[good]), SPEED_PERCENTILE)) / interval,
         distance_px=float(np.median(np.abs(distance(by)[inliers]))) if len(inliers) else np.nan,
-        readout_frames=readout,
-        readout_sigma=readout_sigma,
+        readout_frames=readout * interval,
+        readout_sigma=readout_sigma * interval,
     )
 
 
@@ -363,11 +373,11 @@ def _inliers(tracked: list[_Tracked]) -> np.ndarray:
 
 
 def _readout(e: np.ndarray, s: float, b: float, frame: np.ndarray) -> tuple[float, float]:
-    """r in frames, and its sigma, from the distances (m, 4) and the solution of (3); NaN where all motion is in the same row.  (4)"""
+    """r in frames, and its sigma, from the distances (m, 5) and the solution of (3); NaN where all motion is in the same row.  (4)"""
     rate, curvature, y = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2, e[:, 3]
     unknowns = np.array([0.0, s, b])
     for _ in range(STEPS):
-        at = unknowns[1] - unknowns[0] * y
+        at = e[:, 4] + unknowns[1] - unknowns[0] * y
         v = e[:, 1] + at * rate + at**2 * curvature - unknowns[2]
         w = 1 / (1 + (v / SCALE_PX) ** 2)
         slope = rate + 2 * at * curvature

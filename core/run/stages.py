@@ -38,13 +38,17 @@ def _measure_input(footage: Footage) -> Any:
     """The images, the cameras, and the person's masks."""
     take = footage.take
     regions = [c for c in _corrections(take) if c[0] == "region"]
-    views = [(v.name, v.offset_frames) for v in take.views]
+    views = [(v.name, v.offset_frames, *v.clock, *_timestamps(take, v)) for v in take.views]
     files = [[_stamp(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
     person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
     swept = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
     return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, starts.ALGORITHM, *swept
+
+
+def _timestamps(take: Take, view: View) -> tuple[Any, ...]:
+    return () if view.timestamps is None else (_stamp(take.folder / view.timestamps),)
 
 
 def _person_files(take: Take, view: View) -> Any:

@@ -67,6 +67,7 @@ class FrameStarts:
             take.rig_path,
             repr((take.interlaced, take.first_field, take.reference_view, take.clicks.table())),
             repr([(v.name, v.offset_frames) for v in take.views]),
+            repr([clock.digest() for clock in footage.clocks]) if footage.clocks else "",
             repr(footage.delay_images) if any(footage.delay_images) else "",
             repr(footage.click_sigma_px) if take.clicks.surface else "",
             repr(footage.reduction.tolist()) if footage.full_size_px else "",
@@ -180,16 +181,17 @@ def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
     Raises:
         InputError: see `Footage.read`.
     """
-    grid, step = footage.take.rows_at(frame), footage.take.field_layout.per_image
+    grid = footage.take.rows_at(frame)
 
-    def neighbour(k: int, at: int) -> np.ndarray | None:
-        number, sequence = footage.number(k, at), footage.sequences[k]
+    def image(k: int, number: int) -> np.ndarray | None:
+        sequence = footage.sequences[k]
         return grid.rows(footage.reduced_image(k, sequence.read(number))) if 0 <= number < sequence.count else None
 
     rows = [grid.rows(image) for image in footage.read(frame)]
-    for k, late in enumerate(footage.delay_images):
-        if late:
-            rows[k] = retimed(rows[k], neighbour(k, frame - step), neighbour(k, frame + step), late)
+    for k in range(len(rows)):
+        if late := footage.delay(k, frame):
+            number = footage.number(k, frame)
+            rows[k] = retimed(rows[k], image(k, number - 1), image(k, number + 1), late)
     return rows
 
 
@@ -355,10 +357,8 @@ def _background_and_person(now: FrameViews, seeds: Approximations) -> tuple[np.n
 def image_digests(footage: Footage, frame: int) -> list[str]:
     """The identity of a frame's images: the content of image files; the size and date of a movie. With interpolated views it includes the
     frames before and after."""
-    step = footage.take.field_layout.per_image
-    near = (frame - step, frame, frame + step) if any(footage.delay_images) else (frame,)
     parts = []
-    for path in (path for f in near if f in footage.frames or f == frame for path in footage.files(f)):
+    for path in footage.files(frame):
         try:
             state = path.stat()
             parts.append(store.digest(path) if path.suffix.lower() in IMAGE_ENDINGS else f"{state.st_size} {state.st_mtime_ns}")

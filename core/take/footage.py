@@ -1,5 +1,6 @@
 """Opened footage: the images of a take with their cameras, as large as their files or reduced."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
+from ..images.retime import Recent
 from ..images.sequence import ImageSequence, open_sequence
+from .clock import Clock, clocks_of
 from .take import Clicks, Take
 
 
@@ -22,12 +25,28 @@ class Footage:
     sequences: tuple[ImageSequence, ...]
     frames: range
     click_sigma_px: float = CLICK_SIGMA_PX  # of the take's clicks
+    clocks: tuple[Clock, ...] = ()  # of the views; empty where they are shifted by whole frames at most
     delay_images: tuple[float, ...] = ()  # time offset by which the images of each view are interpolated; empty: none
     full_size_px: tuple[tuple[int, int], ...] = ()  # of the views' images, where they are reduced to the cameras' size; else empty
 
     def number(self, view: int, frame: int) -> int:
         """The number of the image in a view's sequence that shows a frame of the take."""
+        if self.clocks:
+            return self.clocks[view].nearest(self.take.instant_s(frame))
         return self.take.field_layout.image(frame) + self.take.views[view].offset_frames
+
+    def frames_of_images(self, view: int, numbers: np.ndarray) -> np.ndarray:
+        """The frames (n,) of the take that images (n,) of a view show, of both fields the first; −1 for images between those of frames."""
+        per = self.take.field_layout.per_image
+        if not self.clocks:
+            return np.asarray(per * (numbers - self.take.views[view].offset_frames))
+        frames = [per * round(self.clocks[view].time_s(int(n)) * self.take.fps / per) for n in numbers]
+        return np.array([f if self.number(view, f) == n else -1 for f, n in zip(frames, numbers)], dtype=int)
+
+    def delay(self, view: int, frame: int) -> float:
+        """By how many image intervals the image of a view is later than the instant of a frame, as far as it is known."""
+        known = self.clocks[view].delay_images(self.number(view, frame), self.take.instant_s(frame)) if self.clocks else 0.0
+        return known + (self.delay_images[view] if self.delay_images else 0.0)
 
     def single(self) -> "Footage":
         """The footage with one frame per image."""
@@ -98,9 +117,21 @@ class Footage:
             full_size_px=tuple(camera.size_px for camera in cameras),
         )
 
+    def interval_frames(self, view: int) -> float:
+        """The time between two images of a view, in frames of the take."""
+        return self.clocks[view].period_s * self.take.fps if self.clocks else float(self.take.field_layout.per_image)
+
     def files(self, frame: int) -> list[Path]:
-        """The files of one frame; a movie is the file of all of its frames."""
-        return [f[self.number(k, frame)] if len(f := s.files()) > 1 or s.count == 1 else f[0] for k, s in enumerate(self.sequences)]
+        """The files of one frame, and where a view is interpolated also of its images before and after; a movie is the file of all."""
+        files = list[Path]()
+        for k, sequence in enumerate(self.sequences):
+            own, number = sequence.files(), self.number(k, frame)
+            if len(own) < 2 and sequence.count > 1:
+                files.append(own[0])
+            else:
+                around = 1 if self.delay(k, frame) else 0
+                files += own[max(number - around, 0) : number + around + 1]
+        return files
 
 
 def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *, click_sigma_px: float = CLICK_SIGMA_PX) -> Footage:
@@ -114,19 +145,23 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
     rig = read_rig(take.rig_path)
     rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata)
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
-    frames = footage_frames(take, sequences)
-    footage = Footage(take=take, rig=rig, sequences=sequences, frames=frames, click_sigma_px=click_sigma_px)
+    frames, clocks = footage_frames(take, sequences), clocks_of(take, sequences)
+    if clocks:
+        sequences = tuple(s if isinstance(s, Recent) else Recent(s) for s in sequences)  # read with their neighbours in time
+    footage = Footage(take=take, rig=rig, sequences=sequences, frames=frames, clocks=clocks, click_sigma_px=click_sigma_px)
     _check_clicks(footage)
     return footage
 
 
 def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
-    """The frames of a take that are measured.
+    """The frames of a take that are measured: those of `frames`; else all, and where the views have clocks, those that all of them show.
 
     Raises:
         InputError: the views have no common frames, or not those in the take.
     """
-    per = take.field_layout.per_image
+    per, clocks = take.field_layout.per_image, clocks_of(take, sequences)
+    if clocks:
+        return _common_frames(take, per, clocks, [s.count for s in sequences])
     counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
     first = per * max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:
@@ -142,6 +177,26 @@ def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
         has = f"the footage has frames {first} to {min(counts)} (half-open)"
         raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; correct it in take.toml.")
     return range(start, stop)
+
+
+def _common_frames(take: Take, per: int, clocks: tuple[Clock, ...], counts: list[int]) -> range:
+    """The frames, from 0 on, for which every view has an image within half an interval."""
+    rate = take.fps / per
+    first = max(0, max(math.ceil((c.time_s(0) - c.period_s / 2) * rate) for c in clocks))
+    stop = min(math.floor((c.time_s(n - 1) + c.period_s / 2) * rate) for c, n in zip(clocks, counts)) + 1
+    while first < stop and any(c.nearest(first / rate) < 0 for c in clocks):
+        first += 1
+    while first < stop and any(c.nearest((stop - 1) / rate) >= n for c, n in zip(clocks, counts)):
+        stop -= 1
+    if stop <= first:
+        spans = ", ".join(f"{v.name} from {c.time_s(0):.2f} to {c.time_s(n - 1):.2f} s" for v, c, n in zip(take.views, clocks, counts))
+        raise InputError(f"The views of {take.folder.name} have no frame in common ({spans}); correct `start` in take.toml.")
+    if take.frames is None:
+        return range(per * first, per * stop)
+    if take.frames[0] < per * first or take.frames[1] > per * stop:
+        has = f"the views have frames {per * first} to {per * stop} (half-open) in common"
+        raise InputError(f"`frames` of {take.folder.name} is [{take.frames[0]}, {take.frames[1]}], but {has}; correct it in take.toml.")
+    return range(*take.frames)
 
 
 def _check_clicks(footage: Footage) -> None:

@@ -16,6 +16,8 @@ from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
 from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
+from .clock import KEYS as CLOCK_KEYS
+from .clock import view_clock
 from .sources import (
     PERSON_SOURCES,
     KeypointSource,
@@ -64,7 +66,8 @@ Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class View:
-    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`.
+    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`, unless it has a clock
+    (`clock.clocks_of`): its own images per second, the second at which it starts, a drift, or a file of time stamps.
 
     One of `mask`, `masks` (a pattern, an image for every image) and `background` may give the silhouette of the person.
     """
@@ -73,9 +76,23 @@ class View:
     images: str | None = None
     movie: str | None = None
     offset_frames: int = 0
+    fps: float | None = None
+    start_s: float = 0.0
+    drift_ppm: float = 0.0
+    timestamps: str | None = None
     mask: str | None = None
     masks: str | None = None
     background: str | None = None
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether its images are not simply those of the take's frames, shifted by a number of frames."""
+        return self.fps is not None or self.timestamps is not None or bool(self.start_s or self.drift_ppm)
+
+    @property
+    def clock(self) -> tuple[float | str | None, ...]:
+        """What sets its clock, for digests; empty without one."""
+        return (self.fps, self.start_s, self.drift_ppm, self.timestamps) if self.has_clock else ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -147,6 +164,11 @@ class Take:
     def time_s(self, frames: np.ndarray) -> np.ndarray:
         """When frames (T,) of the take were taken, in seconds after frame 0."""
         return frame_time_s(frames, self.fps)
+
+    def instant_s(self, frame: int) -> float:
+        """When the image of a frame was taken, in seconds after frame 0: for both fields of an image, the instant of the first."""
+        per = self.field_layout.per_image
+        return frame // per * per / self.fps
 
     def rows_at(self, frame: int) -> RowGrid:
         """The rows of the image that show a frame of the take."""
@@ -249,7 +271,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
     views = []
     for entry in entries:
         label = f"view {entry.get('name')!r} of {where}"
-        check_keys(entry, ("name", "images", "movie", "offset_frames", *PERSON_SOURCES), label)
+        check_keys(entry, ("name", "images", "movie", "offset_frames", *CLOCK_KEYS, *PERSON_SOURCES), label)
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"]:
             raise InputError(f'A {label} needs a name (text), such as "L".')
@@ -260,7 +282,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
-        views.append(View(name=entry["name"], offset_frames=offset, **files))
+        views.append(View(name=entry["name"], offset_frames=offset, **files, **view_clock(entry, label)))
     if len({v.name.casefold() for v in views}) < len(views):
         raise InputError(f"Two views of {where} have the same name, or names that differ only in capitals; give each its own.")
     return tuple(views)

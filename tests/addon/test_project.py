@@ -228,3 +228,20 @@ def test_a_deleted_clip_is_told_and_a_wrong_take_changes_nothing(project: Module
     blender.data.movieclips.remove(project.clips_of(scene)["C"])
     with pytest.raises(project.InputError, match="clip of view C was deleted. Press Reload Footage"):
         project.table(scene)
+
+
+def test_clocks_of_views_survive_the_panel(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    """Keys that set a view's clock stay in take.toml, its clip starts with the frame that shows its first image, and no clicks are
+    accepted in views that Blender shows at another rate."""
+    scene, table = blender.context.scene, read_table(take) | {"keyframes": [], "seeds": {}, "frames": [4, 6]}
+    table["views"][0] |= {"start": 0.0812, "drift_ppm": 12.5, "offset_frames": 0}
+    write_table(take, table)
+    project.open_take(scene, take)
+    written = project.table(scene)
+    assert {k: written["views"][0][k] for k in ("start", "drift_ppm")} == {"start": 0.0812, "drift_ppm": 12.5}
+    assert scene.tricap.views[0].clip.frame_start == round(0.0812 * table["fps"]) == 2
+    project.check_rates(scene)
+    scene.tricap.views[2].fps = 2 * table["fps"]
+    assert project.table(scene)["views"][2]["fps"] == 2 * table["fps"]
+    with pytest.raises(Exception, match="View R does not have 29.97 images per second"):
+        project.check_rates(scene)

@@ -160,8 +160,8 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
         raise InputError(f"There are no keypoints “{source.files}” in {folder}; correct `files` under [[keypoints]].")
     if source.view:
         points = read_keypoints(paths)
-        view = next(v for v in footage.take.views if v.name == source.view)
-        frames = footage.take.field_layout.per_image * (points.number - source.offset_frames - view.offset_frames)
+        view = [v.name for v in footage.take.views].index(source.view)
+        frames = footage.frames_of_images(view, points.number - source.offset_frames)
         return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
     if len(paths) > 1:
         raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")

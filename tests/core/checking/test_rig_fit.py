@@ -112,7 +112,7 @@ def mismatched(own: list[Camera], *, share: float) -> list[_Tracked]:
         pair = both(right, false)
         rate = np.random.default_rng(t).normal(0, 30, len(pair.xi_px))
         miss = pair.epipolar_distance_px(own)
-        distances = np.stack([miss - rate, miss, miss + rate, pair.xj_px[:, 1] / SIZE[1] - 0.5], axis=1)
+        distances = np.stack([miss - rate, miss, miss + rate, pair.xj_px[:, 1] / SIZE[1] - 0.5, 0 * miss], axis=1)
         frames.append(_Tracked(matches=pair, distances=distances))
     return frames
 
