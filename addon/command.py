@@ -13,6 +13,7 @@ from ..core.cli import main as commands
 from ..core.cli.arguments import check_simplify, standard_output_kept_clean
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
+from .movie_sound import movie_sound
 from .retarget import command as retargeting
 
 DETAIL = 2  # that of body/skin/closed_skin.py, which is imported only when a scene is built
@@ -25,6 +26,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def add_commands(subparsers: Any) -> None:
     """Add the sub-command `scene` to an argparse sub-parsers object; its `run(args, monitor)` returns lines to print."""
+    if importlib.util.find_spec("bpy") is not None:
+        subparsers.choices["synchronise"].set_defaults(movie_sound=movie_sound)
     about = "a Blender file with armature, action, skins, cameras, footage, cloud and trajectories"
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")

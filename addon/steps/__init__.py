@@ -4,9 +4,9 @@ import bpy
 
 
 def _classes() -> tuple[type, ...]:
-    from . import cameras, check, export, footage, panel, person
+    from . import cameras, check, export, footage, panel, person, synchronise
 
-    return (*footage.CLASSES, *person.CLASSES, *cameras.CLASSES, *check.CLASSES, *export.CLASSES, *panel.CLASSES)
+    return (*footage.CLASSES, *person.CLASSES, *cameras.CLASSES, *check.CLASSES, *synchronise.CLASSES, *export.CLASSES, *panel.CLASSES)
 
 
 def register() -> None:

@@ -38,7 +38,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
     parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_new, _stages, _joints, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
+    for add in (_new, _stages, _joints, _synchronise, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
         add(commands)
     for sub in commands.choices.values():
         for argument in sub._actions:
@@ -117,6 +117,15 @@ def _joints(commands: Any) -> None:
     joints.add_argument("--write", action="store_true", help="write them into take.toml as clicks, where they are certain")
     joints.add_argument("--json", action="store_true", help="print them as JSON")
     _set_argument(joints)
+
+
+def _synchronise(commands: Any) -> None:
+    about = "when each view began: by its sound (NAME.wav, or the movie's own in Blender), then by the rays of moving points"
+    parser = _command(commands, "synchronise", about, action("synchronise"))
+    _take_argument(parser)
+    parser.add_argument("--write", action="store_true", help="write the starts into take.toml, if all were found")
+    parser.add_argument("--json", action="store_true", help="print them as JSON")
+    parser.set_defaults(movie_sound=None)  # the add-on's command reads that of movies
 
 
 def _check(commands: Any) -> None:

@@ -175,3 +175,13 @@ def plane_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plane = Body(half_m=(0.26, 0.2), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
     frames = [[plane.moved(rotation_from_vector(np.array([0.0, 0.0, 0.026 * i])), [0.007 * i, -0.003 * i, 0.0])] for i in range(4)]
     return write_take(tmp_path_factory.mktemp("plane"), three_cameras(), frames)
+
+
+@pytest.fixture(scope="session")
+def sixty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """18 frames of a swinging arm at 60 images per second, without noise; do not change it. Every second image is a take at 30."""
+    from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+
+    folder = tmp_path_factory.mktemp("sixty") / "take"
+    make_arm_take(folder, ArmTakeSettings(width_px=224, frames=18, fps=60.0, interlaced="none", swing_s=0.8, noise=0.0))
+    return folder

@@ -12,7 +12,6 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.run.stages import stage_keys
 from tricap.core.run.take_run import settings_of
 from tricap.core.surface.starts import image_digests, measured_rows
-from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.clock import Clock, read_timestamps
 from tricap.core.take.footage import Footage, open_take
 from tricap.core.take.take import FrameClicks, Take, View, read_take
@@ -54,8 +53,8 @@ def test_time_stamps_of_one_or_several_views_are_read_in_the_order_of_the_images
         ("time_s,\0x\n\0", "Cannot read|no time stamps|not a number"),
     ],
 )
-def test_time_stamps_that_cannot_be_used_are_refused_in_one_sentence(filmed: Path, tmp_path: Path, text: str, said: str) -> None:
-    take = loose(filmed, tmp_path / "take", {"L": range(3), "C": range(3), "R": range(3)})
+def test_time_stamps_that_cannot_be_used_are_refused_in_one_sentence(sixty: Path, tmp_path: Path, text: str, said: str) -> None:
+    take = loose(sixty, tmp_path / "take", {"L": range(3), "C": range(3), "R": range(3)})
     (take.folder / "t.csv").write_text(text)
     with pytest.raises(InputError, match=said) as refused:
         open_take(replace(take, views=(replace(take.views[0], timestamps="t.csv"), *take.views[1:])))
@@ -71,39 +70,31 @@ def test_impossible_clocks_are_refused(tmp_path: Path, line: str) -> None:
         read_take(tmp_path)
 
 
-@pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An arm at 60 images per second."""
-    folder = tmp_path_factory.mktemp("clock") / "take"
-    make_arm_take(folder, ArmTakeSettings(width_px=224, frames=18, fps=60.0, interlaced="none", swing_s=0.8, noise=0.0))
-    return folder
-
-
-def loose(filmed: Path, folder: Path, images: dict[str, range]) -> Take:
+def loose(sixty: Path, folder: Path, images: dict[str, range]) -> Take:
     """The same, of which the views have some images each, at 30 frames per second."""
     folder.mkdir()
-    (folder / "rig.toml").write_bytes((filmed / "rig.toml").read_bytes())
+    (folder / "rig.toml").write_bytes((sixty / "rig.toml").read_bytes())
     for view, numbers in images.items():
         (folder / view).mkdir()
         for i, n in enumerate(numbers):
-            (folder / view / f"{i:04d}.png").symlink_to(filmed / view / f"{n:04d}.png")
-    return replace(read_take(filmed), folder=folder, rig_path=folder / "rig.toml", fps=30.0, clicks=FrameClicks())
+            (folder / view / f"{i:04d}.png").symlink_to(sixty / view / f"{n:04d}.png")
+    return replace(read_take(sixty), folder=folder, rig_path=folder / "rig.toml", fps=30.0, clicks=FrameClicks())
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2)))
 
 
-def test_views_at_other_rates_show_the_instants_of_the_take(filmed: Path, tmp_path: Path) -> None:
+def test_views_at_other_rates_show_the_instants_of_the_take(sixty: Path, tmp_path: Path) -> None:
     """L has 60 images per second and starts 2 of them late, R has 30, half a frame late: R is interpolated to the instants."""
-    take = loose(filmed, tmp_path / "take", {"L": range(2, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
+    take = loose(sixty, tmp_path / "take", {"L": range(2, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
     views = tuple(replace(v, **clock) for v, clock in zip(take.views, ({"fps": 60.0, "start_s": 2 / 60}, {}, {"start_s": 1 / 60})))
     footage = open_take(replace(take, views=views))
     assert footage.frames == range(1, 9)
     for frame in footage.frames:
         assert (footage.number(0, frame), footage.delay(0, frame)) == (2 * frame - 2, 0.0)
         assert footage.number(2, frame) in (frame - 1, frame) and abs(footage.delay(2, frame)) == pytest.approx(0.5, abs=0.01)
-    truth = open_take(replace(read_take(filmed)))
+    truth = open_take(replace(read_take(sixty)))
     for frame in (4, 6):
         shown, right = measured_rows(footage, frame), measured_rows(truth, 2 * frame)
         assert np.array_equal(shown[0], right[0]) and np.array_equal(shown[1], right[1])
@@ -112,8 +103,8 @@ def test_views_at_other_rates_show_the_instants_of_the_take(filmed: Path, tmp_pa
     assert list(footage.frames_of_images(0, np.array([0, 1, 2]))) == [1, -1, 2]
 
 
-def test_keys_of_stages_follow_clocks(filmed: Path, tmp_path: Path) -> None:
-    take = replace(read_take(filmed), clicks=FrameClicks())
+def test_keys_of_stages_follow_clocks(sixty: Path, tmp_path: Path) -> None:
+    take = replace(read_take(sixty), clicks=FrameClicks())
     settings, keys = settings_of({}, {}, "x"), set()
     for clock in ({}, {"start_s": 0.01}, {"start_s": 0.01, "drift_ppm": 9.0}):
         views = (replace(take.views[0], **clock), *take.views[1:])
@@ -121,9 +112,9 @@ def test_keys_of_stages_follow_clocks(filmed: Path, tmp_path: Path) -> None:
     assert len(keys) == 3
 
 
-def test_the_rays_give_what_a_clock_lacks(filmed: Path, tmp_path: Path) -> None:
+def test_the_rays_give_what_a_clock_lacks(sixty: Path, tmp_path: Path) -> None:
     """L at 60, R at 30 images per second half a frame late, but its start is given 6 ms too early."""
-    take = loose(filmed, tmp_path / "take", {"L": range(0, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
+    take = loose(sixty, tmp_path / "take", {"L": range(0, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
     for wrong_s in (0.0, 0.006):
         views = tuple(replace(v, **c) for v, c in zip(take.views, ({"fps": 60.0}, {}, {"start_s": 1 / 60 - wrong_s})))
         offsets = {o.view: o for o in estimate_offsets(open_take(replace(take, views=views)), Monitor())}
@@ -131,8 +122,8 @@ def test_the_rays_give_what_a_clock_lacks(filmed: Path, tmp_path: Path) -> None:
         assert abs(offsets["L"].delay_frames) / 30 < 0.001 and abs(offsets["R"].delay_frames / 30 - wrong_s) < 0.001
 
 
-def test_views_without_a_common_frame_are_refused(filmed: Path) -> None:
-    take = replace(read_take(filmed), clicks=FrameClicks())
+def test_views_without_a_common_frame_are_refused(sixty: Path) -> None:
+    take = replace(read_take(sixty), clicks=FrameClicks())
     late = replace(take, views=(replace(take.views[0], start_s=700.0), *take.views[1:]))
     with pytest.raises(InputError, match=r"no frame in common \(L from 700.00 to 700.28 s"):
         open_take(late)

@@ -1,0 +1,1 @@
+"""When each view of a take began, found in its footage."""

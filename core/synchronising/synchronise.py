@@ -1,0 +1,195 @@
+"""`tricap synchronise`: when each view began, by the sound of its recording, then by the rays of points that move.
+
+Sound gives the beginning to some tenths of a millisecond, the drift of the clock, and finds recordings that were started minutes apart. It
+needs time to travel: between cameras at a distance b of each other a noise arrives up to b / 343 m/s earlier in one, which the sigma
+contains (uniformly distributed directions: b / √3 / 343 m/s). The rays (`checking.timing`) have no such error; with a rig they measure what
+is left, or everything where there is no sound and the views began within the reach of `tricap check`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..checking.timing import TimeOffset, estimate_offsets
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..take.footage import Footage, open_take
+from ..take.take import Take, View
+from ..take.writing import read_table, write_table
+from .sound import Sound, SoundOffset, offset_between, read_wav
+
+SPEED_OF_SOUND_M_S = 343.0
+USUAL_DISTANCE_M = 2.0  # between two cameras without a rig
+MOST_RAYS_SIGMA_S = 2e-3  # a less exact estimate from rays is not used
+TRACKING = 2.0  # times the sigma of the rays, and …
+LEAST_IMAGES = 0.005  # … images: by how much tracked points are wrong in the same way in all frames (measured, synthetic footage)
+CONTRADICTION = 5.0  # sigmas by which rays and sound may differ, and more than …
+IMAGE_LATENESS_S = 0.1  # … by which the images in a file are later than its sound
+MovieSound = Callable[[Path], Sound | None]  # the sound of a movie's own track, None without one
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewTiming:
+    """When a view began. `start_s` and `drift_ppm` are its keys in take.toml; NaN where it was not found."""
+
+    view: str
+    start_s: float
+    sigma_s: float
+    drift_ppm: float
+    method: str  # "reference", "sound", "rays", "sound and rays", or "" where it was not found
+    problem: str = ""  # why it was not found, and what to do
+
+    @property
+    def found(self) -> bool:
+        """Whether its beginning is known."""
+        return bool(self.method)
+
+    def to_table(self) -> dict[str, object]:
+        """The figures, for JSON; None where the view was not found."""
+        figures = {
+            "start_s": round(float(self.start_s), 6),
+            "sigma_s": round(float(self.sigma_s), 6),
+            "drift_ppm": round(float(self.drift_ppm), 3),
+        }
+        return {**(figures if self.found else dict.fromkeys(figures)), "by": self.method, "problem": self.problem}
+
+    def __str__(self) -> str:
+        if not self.found:
+            return f"View {self.view}: {self.problem}"
+        if self.method == "reference":
+            return f"View {self.view}: starts at {self.start_s:.4f} s (the reference view)."
+        drift = f", its clock is slow by {self.drift_ppm:.1f} ppm" if self.drift_ppm else ""
+        return f"View {self.view}: starts at {self.start_s:.4f} s ± {1e3 * self.sigma_s:.2f} ms, by {self.method}{drift}."
+
+
+def synchronise(take: Take, monitor: Monitor, movie_sound: MovieSound | None = None) -> tuple[ViewTiming, ...]:
+    """The beginning of every view on the clock of the reference view, in the order of the views.
+
+    The sound of view NAME is NAME.wav in the take's folder, or its movie's own as `movie_sound` reads it.
+
+    Raises:
+        InputError: a sound or an image cannot be read.
+        Cancelled: the monitor was cancelled.
+    """
+    sounds = {v.name: _sound(take, v, movie_sound) for v in take.views}
+    reference = take.views[take.reference]
+    timings = {reference.name: _timing(reference, reference.start_s, 0.0, reference.drift_ppm, "reference")}
+    others = [v for v in take.views if v is not reference]
+    for n, view in enumerate(others):
+        a, b = sounds[reference.name], sounds[view.name]
+        heard = offset_between(a, b, monitor.part("comparing sound", n, len(others))) if a and b else None
+        timings[view.name] = _by_sound(take, view, heard) if heard else _lost(take, view, a, b, sounded=movie_sound is not None)
+    return (
+        _with_rays(take, [timings[v.name] for v in take.views], monitor)
+        if take.rig_path.is_file()
+        else tuple(timings[v.name] for v in take.views)
+    )
+
+
+def write_starts(folder: Path, timings: tuple[ViewTiming, ...]) -> bool:
+    """Write the beginnings into FOLDER/take.toml; returns whether something changed.
+
+    Raises:
+        InputError: a view was not found, or the file cannot be written; it is unchanged then.
+    """
+    lost = [timing for timing in timings if not timing.found]
+    if lost:
+        raise InputError(f"Nothing was written. {lost[0]}")
+    table, of_view = read_table(folder), {timing.view: timing for timing in timings}
+    views = []
+    for entry in table["views"]:
+        timing = of_view[entry["name"]]
+        keys = {"start": round(float(timing.start_s), 6), "drift_ppm": round(float(timing.drift_ppm), 3)}
+        offset = {} if timing.method != "reference" else {k: entry[k] for k in ("offset_frames",) if k in entry}
+        rest = {k: v for k, v in entry.items() if k not in ("start", "drift_ppm", "offset_frames")}
+        views.append(rest | offset | {key: value for key, value in keys.items() if value})
+    return write_table(folder, table | {"views": views})
+
+
+def _sound(take: Take, view: View, movie_sound: MovieSound | None) -> Sound | None:
+    wav = take.folder / f"{view.name}.wav"
+    if wav.is_file():
+        return read_wav(wav)
+    return movie_sound(take.folder / view.movie) if view.movie is not None and movie_sound is not None else None
+
+
+def _timing(view: View, start_s: float, sigma_s: float, drift_ppm: float, method: str) -> ViewTiming:
+    return ViewTiming(view=view.name, start_s=start_s, sigma_s=sigma_s, drift_ppm=drift_ppm, method=method)
+
+
+def _by_sound(take: Take, view: View, heard: SoundOffset) -> ViewTiming:
+    """On the clock of the reference view, T = T₀ + (1 + k₀) t."""
+    reference = take.views[take.reference]
+    rate = take.fps / take.field_layout.per_image
+    zero_s = reference.start_s - reference.offset_frames / (reference.fps or rate)
+    slow = 1 + 1e-6 * reference.drift_ppm
+    start_s = zero_s + slow * heard.offset_s
+    drift_ppm = 1e6 * (slow * (1 + heard.drift) - 1)
+    sigma_s = float(np.hypot(heard.sigma_s, _distance_m(take, view) / np.sqrt(3) / SPEED_OF_SOUND_M_S))
+    return _timing(view, start_s, sigma_s, drift_ppm, "sound")
+
+
+def _distance_m(take: Take, view: View) -> float:
+    if not take.rig_path.is_file():
+        return USUAL_DISTANCE_M
+    from ..geometry.rig import read_rig
+
+    rig = read_rig(take.rig_path)
+    return float(np.linalg.norm(rig[view.name].centre_m - rig[take.reference_view].centre_m))
+
+
+def _lost(take: Take, view: View, a: Sound | None, b: Sound | None, *, sounded: bool) -> ViewTiming:
+    if a is None or b is None:
+        name = take.reference_view if b is not None else view.name
+        track = ", and no track in its movie" if sounded and view.movie is not None else ""
+        why = f"there is no sound of {name} (no {name}.wav{track})"
+    elif a.silent or b.silent:
+        why = f"the sound of {view.name if b.silent else 'the reference view'} is silent"
+    else:
+        why = "its sound has nothing in common with that of the reference view"
+    advice = "Clap once at the beginning of a recording, or give its `start` in take.toml."
+    return ViewTiming(view=view.name, start_s=np.nan, sigma_s=np.inf, drift_ppm=0.0, method="", problem=f"{why}. {advice}")
+
+
+def with_starts(take: Take, timings: Mapping[str, ViewTiming]) -> Take:
+    """The take with the beginnings that were found."""
+    found = {name: t for name, t in timings.items() if t.found and t.method != "reference"}
+    views = tuple(
+        replace(v, start_s=found[v.name].start_s, drift_ppm=found[v.name].drift_ppm, offset_frames=0) if v.name in found else v
+        for v in take.views
+    )
+    return replace(take, views=views)
+
+
+def _with_rays(take: Take, timings: list[ViewTiming], monitor: Monitor) -> tuple[ViewTiming, ...]:
+    """The beginnings improved by the rays of moving points, where these are exact enough."""
+    started = with_starts(take, {t.view: t for t in timings})
+    rate = take.fps / take.field_layout.per_image
+    views = tuple(replace(v, fps=v.fps or rate) for v in started.views)  # with clocks, views may differ in length
+    clicks = replace(started.clicks, joints={}, surface=())
+    started = replace(started, views=views, clicks=clicks, keyframes=(), frames=None)  # frames may be those of wrong starts
+    footage = open_take(started)
+    offsets = estimate_offsets(footage.single(), monitor)
+    return tuple(_improved(started, footage, t, o) for t, o in zip(timings, offsets))
+
+
+def _improved(take: Take, footage: Footage, timing: ViewTiming, offset: TimeOffset) -> ViewTiming:
+    rate = footage.single().take.fps
+    late_s, sigma_s = offset.delay_frames / rate, float(np.hypot(TRACKING * offset.sigma_frames, LEAST_IMAGES)) / rate
+    if timing.method == "reference" or offset.method != "rays" or sigma_s > MOST_RAYS_SIGMA_S:
+        return timing
+    if timing.found and abs(late_s) > max(CONTRADICTION * np.hypot(sigma_s, timing.sigma_s), IMAGE_LATENESS_S):
+        why = f"its sound and the rays of moving points contradict each other by {1e3 * late_s:+.0f} ms"
+        advice = "Is its sound that of this recording, and the rig that of these cameras?"
+        return replace(timing, method="", problem=f"{why}. {advice}")
+    view = next(v for v in take.views if v.name == timing.view)
+    before_s = timing.start_s if timing.found else _zero(view, rate)
+    method = "sound and rays" if timing.found else "rays"
+    return replace(timing, start_s=before_s + late_s, sigma_s=sigma_s, method=method, problem="")
+
+
+def _zero(view: View, rate: float) -> float:
+    """The moment of image 0 as take.toml has it."""
+    return view.start_s - view.offset_frames / (view.fps or rate)
