@@ -3,6 +3,7 @@
 import json
 import os
 import time
+import wave
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,8 +37,10 @@ from tricap.core.run.inspection import patch_boxes, read_removed, read_tracks
 from tricap.core.run.inspection import read_points as read_shown
 from tricap.core.run.stages import valid_stages
 from tricap.core.run.take_run import Run
+from tricap.core.synchronising.sound import read_wav
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take.bar_file import read_bar, write_bar
+from tricap.core.take.clock import read_timestamps
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 from tricap.core.tracking.contour import ContourTable
@@ -86,6 +89,12 @@ def kept_motion(folder: Path) -> None:
     except OSError as error:
         raise InputError(str(error)) from error
     from_text(kept).at(np.arange(3))
+
+
+def sound(path: Path) -> None:
+    with wave.open(str(path), "wb") as wav:
+        wav.setparams((2, 2, 16000, 0, "NONE", ""))
+        wav.writeframes(np.random.default_rng(0).integers(-9000, 9000, 800).astype("<i2").tobytes())
 
 
 def points() -> Markers:
@@ -346,6 +355,9 @@ READERS: dict[str, tuple[Make, Read]] = {
     "bvh": (written("a.bvh", bvh_file), lambda f: bvh.read_bvh(f / "a.bvh")),
     "joints.csv": (text("joints.csv", "frame,time_s,joint,x,y,z,sigma\n0,0.0,elbow.R,1,2,3,0.1\n1,0.04,elbow.R,1,2,3,0.1\n"),
                    lambda f: tables.read_joints(f / "joints.csv")),
+    "timestamps": (text("t.csv", "cam_id,frame_index,frame_time\n0,1,20.1\n0,0,20.0\n1,0,20.2\n0,2,20.25\n"),
+                   lambda f: read_timestamps(f / "t.csv", "cam_0")),
+    "wav": (written("a.wav", sound), lambda f: read_wav(f / "a.wav")),
     "motion.csv": (written("motion.csv", motion_table), lambda f: tables.read_motion(f / "motion.csv", read_model("arm.R").skeleton)),
     "frames.csv": (text("frames.csv", FRAMES),
                    lambda f: frame_table.read_frame_table(f / "frames.csv")),

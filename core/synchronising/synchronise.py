@@ -22,7 +22,7 @@ from .sound import Sound, SoundOffset, offset_between, read_wav
 
 SPEED_OF_SOUND_M_S = 343.0
 USUAL_DISTANCE_M = 2.0  # between two cameras without a rig
-MOST_RAYS_SIGMA_S = 2e-3  # a less exact estimate from rays is not used
+MOST_RAYS_SIGMA = 0.06  # frames: a less exact estimate from rays is not used
 TRACKING = 2.0  # times the sigma of the rays, and …
 LEAST_IMAGES = 0.005  # … images: by how much tracked points are wrong in the same way in all frames (measured, synthetic footage)
 CONTRADICTION = 5.0  # sigmas by which rays and sound may differ, and more than …
@@ -178,8 +178,8 @@ def _with_rays(take: Take, timings: list[ViewTiming], monitor: Monitor) -> tuple
 def _improved(take: Take, footage: Footage, timing: ViewTiming, offset: TimeOffset) -> ViewTiming:
     rate = footage.single().take.fps
     late_s, sigma_s = offset.delay_frames / rate, float(np.hypot(TRACKING * offset.sigma_frames, LEAST_IMAGES)) / rate
-    if timing.method == "reference" or offset.method != "rays" or sigma_s > MOST_RAYS_SIGMA_S:
-        return timing
+    if timing.method == "reference" or offset.method != "rays" or sigma_s * rate > MOST_RAYS_SIGMA:
+        return timing if timing.found else replace(timing, problem=f"too few moving points can be matched, and {timing.problem}")
     if timing.found and abs(late_s) > max(CONTRADICTION * np.hypot(sigma_s, timing.sigma_s), IMAGE_LATENESS_S):
         why = f"its sound and the rays of moving points contradict each other by {1e3 * late_s:+.0f} ms"
         advice = "Is its sound that of this recording, and the rig that of these cameras?"
