@@ -67,8 +67,8 @@ class FrameStarts:
             take.rig_path,
             repr((take.interlaced, take.first_field, take.reference_view, take.clicks.table())),
             repr([(v.name, v.offset_frames) for v in take.views]),
-            repr([clock.digest() for clock in footage.clocks]) if footage.clocks else "",
-            repr(footage.delay_images) if any(footage.delay_images) else "",
+            (repr(footage.delay_images) if any(footage.delay_images) else "")
+            + (repr([clock.digest() for clock in footage.clocks]) if footage.clocks else ""),
             repr(footage.click_sigma_px) if take.clicks.surface else "",
             repr(footage.reduction.tolist()) if footage.full_size_px else "",
         )
