@@ -25,13 +25,14 @@ POOR, GOOD = 0.25, 0.5  # gain of a step over the predicted gain (Madsen, Nielse
 STEP_DONE = 1e-4  # rad, m, relative
 COST_DONE = 1e-4
 SIGMAS_DONE = 0.01  # root mean square over the parameters: a step that gains (0.01 σ)² each needs no other
+SLIGHT_STEPS = 2  # in a row: a single slight step may lie before points change limbs, and the next one may gain much
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution(Estimate):
     """The adjusted motion and shape vector, their cost and scales.
 
-    converged: the cost is finite, and the last step was small or gained next to nothing.
+    converged: the cost is finite, and the last step was small or gained next to nothing, or the last two gained little.
     """
 
     cost: float
@@ -47,17 +48,19 @@ def solve(
     monitor: Monitor | None = None,
     stage: str = "fit",
     furthest: float = np.inf,
+    slight_sigmas: float = 0.0,
 ) -> Solution:
     """Minimise the problem's cost. Time and memory are linear in frames.
 
-    `furthest` [rad, m]: the largest change of a DOF in one step; `FURTHEST` from a start that may be far off.
+    `furthest` [rad, m]: the largest change of a DOF in one step; `FURTHEST` from a start that may be far off. `slight_sigmas`: root mean
+    square over the parameters; after `SLIGHT_STEPS` hardly damped steps in a row that gain less, the adjustment ends.
 
     Raises:
         Cancelled: the user asked to stop.
     """
     now = Estimate(motion=np.array(start.motion, dtype=np.float64), vector=np.array(start.vector, dtype=np.float64), scales=start.scales)
     now = replace(now, scales=first_scales(problem, now))
-    damping, done, iteration, last = START_DAMPING, False, 0, float("nan")
+    damping, done, iteration, last, slight = START_DAMPING, False, 0, float("nan"), 0
     while iteration < steps and not done:
         if monitor is not None:
             monitor.step(stage, iteration, steps)
@@ -71,7 +74,9 @@ def solve(
         motion, vector, last = new
         size = max(float(np.abs(motion - now.motion).max()), float(np.abs(vector - now.vector).max()))
         parameters = motion.size + len(problem.free_shape)
-        done = size < STEP_DONE or (lin.cost - last) < max(COST_DONE * lin.cost, SIGMAS_DONE**2 * parameters)
+        gain = lin.cost - last
+        slight = slight + 1 if gain < slight_sigmas**2 * parameters and damping <= START_DAMPING else 0
+        done = size < STEP_DONE or gain < max(COST_DONE * lin.cost, SIGMAS_DONE**2 * parameters) or slight == SLIGHT_STEPS
         now = Estimate(motion=motion, vector=vector, scales=lin.scales(now.scales))
     converged = done and bool(np.isfinite(last))
     return Solution(motion=now.motion, vector=now.vector, scales=now.scales, cost=last, iterations=iteration, converged=converged)

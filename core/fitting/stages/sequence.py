@@ -74,6 +74,8 @@ SIGMAS = "sigmas of the fit"
 ERROR_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that have the simplified body's surface
 LEAST_ANGULAR = 0.3  # of the largest sigmas of angular accelerations: 1,800°/s², as elbows and knees have
+SLIGHT_SIGMAS = 0.05  # rms over the parameters: steps that gain less do not bring joints nearer to the truth, but to the model's errors
+PATCH = 5 / 6  # of `model_patch_m`: against accelerations points weigh more than against the prediction of one frame
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
@@ -102,7 +104,8 @@ def fit_sequence(
     tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=tracks)
     motion, observed = track_poses(tracking, monitor, checkpoints)
     motion = follow_limbs(tracking, motion, monitor)
-    fit = replace(fit, silhouettes=fit.silhouettes.drawn_only())
+    settings = replace(settings, model_patch_m=PATCH * settings.model_patch_m)
+    fit = replace(fit, silhouettes=fit.silhouettes.drawn_only(), settings=settings)
     whole = Recording(
         fit=fit,
         frames=given.frames,
@@ -159,7 +162,7 @@ def _solve(fit: FitContext, problem: Problem, start: Estimate, monitor: Monitor,
     with their first step."""
     steps = fit.settings.sequence_steps
     if fit.settings.method == "joint" or not len(problem.free_shape) or not steps:
-        return solve(problem, start, steps=steps, monitor=monitor, stage=stage)
+        return solve(problem, start, steps=steps, monitor=monitor, stage=stage, slight_sigmas=SLIGHT_SIGMAS)
     turns = replace(problem, fixed=np.arange(start.motion.shape[1])), replace(problem, free_shape=NO_SHAPE)
     iterations = 0
     for cycle in range(steps):
@@ -235,7 +238,7 @@ def _stretch(
     problem = _whole_sequence(part, priors.adjustment)
     pose_only = replace(problem, free_shape=NO_SHAPE)
     start = Estimate(motion=motion[around], vector=shape.vector)
-    solution = solve(pose_only, start, steps=part.fit.settings.sequence_steps, monitor=monitor)
+    solution = solve(pose_only, start, steps=part.fit.settings.sequence_steps, monitor=monitor, slight_sigmas=SLIGHT_SIGMAS)
     solution = _restarted(part, solution, pose_only, monitor)
     local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, pose_only, solution)
     covariance = _covariance(_whole_sequence(part, priors.covariance), solution, factors, shape.covariance)

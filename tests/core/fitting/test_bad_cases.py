@@ -174,3 +174,30 @@ def test_a_step_that_gains_less_than_predicted_makes_the_next_one_shorter() -> N
     assert _next_damping(1e-3, gain=4.0, predicted=10.0) == pytest.approx(1e-3)
     assert _next_damping(1e-3, gain=9.0, predicted=10.0) == pytest.approx(1e-4)
     assert _next_damping(1e-9, gain=9.0, predicted=10.0) == pytest.approx(1e-9)
+
+
+@pytest.mark.parametrize(
+    "gains, damping, iterations",
+    [
+        ((100.0, 1.0, 1.0, 100.0), 1e-6, 3),
+        ((100.0, 1.0, 100.0, 1.0, 1.0, 100.0), 1e-6, 5),  # points changed limbs in between
+        ((100.0, 1.0, 1.0, 100.0, 1.0), 1.0, 5),  # small because they are damped
+    ],
+)
+def test_two_slight_steps_in_a_row_end_an_adjustment(monkeypatch, gains, damping, iterations) -> None:
+    model = read_model("arm.R")
+    parameters = ShapeParameters(default_shape(model))
+    D = len(model.skeleton.dofs)
+    left = list(gains)
+
+    def step(problem, lin, now, *_):
+        return (now.motion + 0.1, now.vector, lin.cost - left.pop(0)), damping
+
+    lin = SimpleNamespace(cost=1000.0, scales=lambda before: before)
+    monkeypatch.setattr("tricap.core.fitting.solve.solver.linearise", lambda problem, now: lin)
+    monkeypatch.setattr("tricap.core.fitting.solve.solver._accepted_step", step)
+    problem = Problem(parameters=parameters, observe=lambda t, state: [])
+    start = Estimate(motion=np.zeros((1, D)), vector=parameters.vector())
+    solution = solve(problem, start, steps=len(gains), slight_sigmas=np.sqrt(2.0 / D))
+    assert solution.iterations == iterations
+    assert solution.converged == (damping < 1)
