@@ -130,12 +130,19 @@ def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, conten
     """
     if any(thing.type == "ARMATURE" for built in scene_build.built_collections(context.scene) for thing in built.all_objects):
         return
-    first = not scene_build.built_collections(context.scene)
+    first, views = not scene_build.built_collections(context.scene), _views(context)
+    through = [view for view in views if first or view.view_perspective == "CAMERA"]
     write_scene(replace(contents, warnings=(), shape=None, motion=None), options=replace(DEFAULTS, studio=False))
-    if first and context.window is not None and not bpy.app.background:
+    if first and views:
         _hide_default_objects(operator, context)
-        for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
-            area.spaces.active.region_3d.view_perspective = "CAMERA"
+    for view in through if context.scene.camera is not None else ():  # the cameras of an earlier build are gone, and their view with them
+        view.view_perspective = "CAMERA"
+
+
+def _views(context: bpy.types.Context) -> list[bpy.types.RegionView3D]:
+    """The 3-D views of the window; none in the background."""
+    areas = context.window.screen.areas if context.window is not None and not bpy.app.background else ()
+    return [area.spaces.active.region_3d for area in areas if area.type == "VIEW_3D"]
 
 
 def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.types.Object) -> None:
