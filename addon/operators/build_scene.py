@@ -126,11 +126,15 @@ def put_into_scene(
 def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
     """Show the results that there are over the footage: cameras, then the cloud, then trajectories.
 
-    A scene with a body stays as it is, with its edits. The first time, the 3-D views look through the scene's camera.
+    A scene with a body stays as it is, with its edits, and so does one whose cameras were calibrated or imported in it: they would be there
+    twice. The first time, the 3-D views look through the scene's camera.
     """
-    if any(thing.type == "ARMATURE" for built in scene_build.built_collections(context.scene) for thing in built.all_objects):
+    collections = scene_build.built_collections(context.scene)
+    built = {thing for collection in collections for thing in collection.all_objects}
+    own_cameras = any(thing.type == "CAMERA" and "tricap_view" in thing and thing not in built for thing in context.scene.objects)
+    if own_cameras or any(thing.type == "ARMATURE" for thing in built):
         return
-    first, views = not scene_build.built_collections(context.scene), _views(context)
+    first, views = not collections, _views(context)
     through = [view for view in views if first or view.view_perspective == "CAMERA"]
     write_scene(replace(contents, warnings=(), shape=None, motion=None), options=replace(DEFAULTS, studio=False))
     if first and views:

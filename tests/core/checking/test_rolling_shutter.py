@@ -68,5 +68,5 @@ def test_a_global_shutter_is_none(tmp_path: Path) -> None:
 
 
 def test_rows_that_all_move_alike_say_nothing() -> None:
-    e = np.column_stack([np.full(40, -2.0), np.zeros(40), np.full(40, 2.0), np.zeros(40)])
+    e = np.column_stack([np.full(40, -2.0), np.zeros(40), np.full(40, 2.0), np.zeros(40), np.zeros(40)])
     assert _readout(e, 0.0, 0.0, np.zeros(40)) == (pytest.approx(np.nan, nan_ok=True), np.inf)

@@ -241,7 +241,8 @@ def told(a: np.ndarray, b: np.ndarray, *, degrees: float = 20.0) -> TimeOffset:
     """What is said of views, so far apart, in which nothing can be followed, by how much moves in them when."""
     beside = Camera(name="R", size_px=(9, 9), matrix=np.eye(3), R_cam_world=rotation_from_vector(np.array([0, np.radians(degrees), 0])))
     seen = SimpleNamespace(energy=np.stack([a, b]))
-    film = SimpleNamespace(survey=seen, cameras=(replace(beside, name="C", R_cam_world=np.eye(3)), beside), frames=list)
+    footage = SimpleNamespace(interval_frames=lambda view: 1.0)
+    film = SimpleNamespace(survey=seen, cameras=(replace(beside, name="C", R_cam_world=np.eye(3)), beside), frames=list, footage=footage)
     return _between(cast(Film, film), 0, 1, "R", Monitor())
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,13 +15,17 @@ from tricap.core.motion.formats.keypoints_json import LAYOUTS
 from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
 from tricap.core.results.folder import Results
+from tricap.core.take.footage import Footage
 from tricap.core.take.sources import keypoint_sources
 from tricap.core.take.take import JOINTS, FrameClicks
 
 
 def _footage(folder):
     views = (SimpleNamespace(name="L", offset_frames=0), SimpleNamespace(name="C", offset_frames=2))
-    return SimpleNamespace(take=SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout()))
+    take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout())
+    footage = SimpleNamespace(take=take, clocks=())
+    footage.frames_of_images = partial(Footage.frames_of_images, footage)
+    return footage
 
 
 def _source(**table):
