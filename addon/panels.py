@@ -1,9 +1,10 @@
-"""Shared by all panels: where they are, sentences wrapped to the sidebar's width, and the status bar. draw() only draws."""
+"""Shared by panels and buttons: their place, what an operator says, wrapped sentences, and the status bar. draw() only draws."""
 
 import textwrap
 
 import bpy
 
+from ..core.foundation.errors import InputError
 from .session import get_session
 
 CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
@@ -15,6 +16,29 @@ class TricapPanel:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "Tricap"
+
+
+class TellingOperator:
+    """Mix-in: `do` is the work; what it says is reported, and so is the sentence of an error."""
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do it."""
+        try:
+            message = self.do(context)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        if message:
+            self.report({"INFO"}, message)  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """The work; returns a sentence to report, or "".
+
+        Raises:
+            InputError: it cannot be done; nothing was changed.
+        """
+        raise NotImplementedError
 
 
 def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:

@@ -38,9 +38,7 @@ class FileState:
     sequences: "dict[tuple[Any, ...], ImageSequence]" = field(default_factory=dict)  # the opened footage, by file
     joints: dict[str, tuple[str, ...]] = field(default_factory=dict)  # those to click, by body model
     click_problems: dict[tuple[Any, ...], str] = field(default_factory=dict)  # by joint, clicks and cameras; "" where there is none
-    late_frames: dict[str, dict[str, int]] = field(default_factory=dict)  # by checked input: the delay of each view
-    camera_of: dict[str, dict[str, str]] = field(default_factory=dict)  # by checked input: the camera that fits each view, if swapped
-    fields_found: dict[str, str] = field(default_factory=dict)  # by checked input: the first field where combing was found, else ""
+    mends: dict[str, Any] = field(default_factory=dict)  # by checked input: what its check found that a press mends (steps.check.Mends)
     checked_keys: set[str] = field(default_factory=set)  # inputs for which a check began by itself
     bar_counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # by view: images searched, and images that show the whole bar
     open_results: OpenResults = field(default_factory=OpenResults)

@@ -69,7 +69,21 @@ class Correct:
         return True
 
 
-class RemoveTrajectory(Correct, bpy.types.Operator):
+class CorrectAtPixel(Correct):
+    """Mix-in: a correction that concerns one pixel of a view in one frame."""
+
+    view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the current frame")  # type: ignore[valid-type]
+    x: bpy.props.FloatProperty(name="X", description="In pixels, 0 at the centre of the left column")  # type: ignore[valid-type]
+    y: bpy.props.FloatProperty(name="Y", description="In pixels, 0 at the centre of the top row, downwards")  # type: ignore[valid-type]
+
+    def frame_of(self, context: bpy.types.Context) -> int:
+        """The frame that is meant."""
+        frame: int = context.scene.frame_current if self.frame < 0 else self.frame
+        return frame
+
+
+class RemoveTrajectory(CorrectAtPixel, bpy.types.Operator):
     """Click wrong trajectories: the nearest one is removed in all frames when step Tracks runs again"""
 
     bl_idname = "tricap.remove_trajectory"
@@ -77,14 +91,9 @@ class RemoveTrajectory(Correct, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     hint = "Click: remove the nearest trajectory    Backspace: undo the last one    Esc: finish"
 
-    view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
-    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the current frame")  # type: ignore[valid-type]
-    x: bpy.props.FloatProperty(name="X", description="In pixels, 0 at the centre of the left column")  # type: ignore[valid-type]
-    y: bpy.props.FloatProperty(name="Y", description="In pixels, 0 at the centre of the top row, downwards")  # type: ignore[valid-type]
-
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Add one correction."""
-        frame = context.scene.frame_current if self.frame < 0 else self.frame
+        frame = self.frame_of(context)
         return {"FINISHED"} if self.add(context, "trajectory", self.view, (frame, frame), [(self.x, self.y)]) else {"CANCELLED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

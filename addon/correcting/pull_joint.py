@@ -15,7 +15,7 @@ from ...core.motion.tables import JointTable, read_joints
 from .. import clicks, folders, project
 from ..overlay import canvas, draw
 from ..overlay.operators import pointed
-from .operators import Correct
+from .operators import CorrectAtPixel
 
 REACHES = 2.0  # of an inspection's reach: how far from the pointer a joint is picked
 
@@ -74,7 +74,7 @@ def pulled(
     return {view: xy_px} | {other: xy for other, xy in seen.items() if cameras[other].sees(xy)}
 
 
-class PullJoint(Correct, bpy.types.Operator):
+class PullJoint(CorrectAtPixel, bpy.types.Operator):
     """Drag a joint of the fitted body over the footage to where it should be. It becomes a keyframe; Fit Again then fits the body to it"""
 
     bl_idname = "tricap.pull_joint"
@@ -83,15 +83,11 @@ class PullJoint(Correct, bpy.types.Operator):
     hint = "Drag a joint to where it should be    Esc: finish"
 
     name: bpy.props.StringProperty(name="Joint", description="Such as wrist.R")  # type: ignore[valid-type]
-    view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
-    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the current frame")  # type: ignore[valid-type]
-    x: bpy.props.FloatProperty(name="X", description="In pixels, 0 at the centre of the left column")  # type: ignore[valid-type]
-    y: bpy.props.FloatProperty(name="Y", description="In pixels, 0 at the centre of the top row, downwards")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Move one joint."""
-        frame = context.scene.frame_current if self.frame < 0 else self.frame
-        return {"FINISHED"} if self._pull(context, self.name, self.view, frame, np.array([self.x, self.y])) else {"CANCELLED"}
+        done = self._pull(context, self.name, self.view, self.frame_of(context), np.array([self.x, self.y]))
+        return {"FINISHED"} if done else {"CANCELLED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Start dragging."""
@@ -143,11 +139,8 @@ class PullJoint(Correct, bpy.types.Operator):
     def _pull(self, context: bpy.types.Context, name: str, view: str, frame: int, xy: np.ndarray) -> bool:
         """Click a joint where it was dragged to; whether that was possible."""
         try:
-            shown, places, cameras = (
-                project.clips_of(context.scene),
-                places_at(fitted_joints(context.scene), frame),
-                cameras_of(context.scene),
-            )
+            shown, cameras = project.clips_of(context.scene), cameras_of(context.scene)
+            places = places_at(fitted_joints(context.scene), frame)
             if view not in shown or name not in places:
                 raise InputError(f"There is no view “{view}”." if view not in shown else f"The fitted body has no joint “{name}”.")
         except InputError as error:

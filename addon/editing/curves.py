@@ -9,6 +9,7 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ..scene.action import MEASURED_KEY, UNCERTAINTY
 from ..scene.armature import RIG_KEY
+from ..scene.standing import curves_of
 
 EDITED = "Edited motion"
 BONE = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.?(.*)')
@@ -19,11 +20,6 @@ def bone_of(curve: bpy.types.FCurve) -> str:
     """The bone of a curve, "" for a curve of the object."""
     found = BONE.fullmatch(curve.data_path)
     return found[1] if found else ""
-
-
-def curves_of(action: bpy.types.Action) -> list[bpy.types.FCurve]:
-    """All curves of an action."""
-    return [curve for layer in action.layers for strip in layer.strips for bag in strip.channelbags for curve in bag.fcurves]
 
 
 def motion_curves(body: bpy.types.Object, *, selected: bool = False) -> list[bpy.types.FCurve]:

@@ -19,6 +19,7 @@ from ..retarget.apply import map_of
 from ..retarget.playing import played_frames
 from ..retarget.read import read_motion, read_rig
 from ..scene.action import key
+from ..scene.standing import bags_of
 from .curves import edited_action, motion_curves
 
 LOCK, EMPTY, ACTION = "Foot lock", "Foot Lock", "Foot lock"
@@ -137,7 +138,7 @@ def remove(body: bpy.types.Object) -> bool:
     for bone in locked:
         bone.constraints.remove(bone.constraints[LOCK])
     action = body.animation_data.action if body.animation_data is not None else None
-    for bag in [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags] if action is not None else ():
+    for bag in bags_of(action) if action is not None else ():
         for curve in [curve for curve in bag.fcurves if curve.data_path.endswith(f'constraints["{LOCK}"].influence')]:
             bag.fcurves.remove(curve)
     actions = {empty.animation_data.action for empty in empties if empty.animation_data is not None} - {None}

@@ -6,25 +6,20 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from ..operators.control_rig import body_of
+from ..panels import TellingOperator
 from . import foot_lock, keys
 
 DEFAULT_ACCELERATION = math.radians(600)  # rad/s²: below that of quick limbs, so that only what is uncertain moves
 
 
-class EditOperator:
-    """Mix-in: `edit` is the work on the body; a fault of the input is reported in its sentence."""
+class EditOperator(TellingOperator):
+    """Mix-in: `edit` is the work on the body."""
 
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do it."""
-        try:
-            message = self.edit(body_of(context, standing_only=False))
-        except InputError as error:
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
-            return {"CANCELLED"}
-        self.report({"INFO"}, message)  # type: ignore[attr-defined]
-        return {"FINISHED"}
+    def do(self, context: bpy.types.Context) -> str:
+        """Edit the body."""
+        return self.edit(body_of(context, standing_only=False))
 
     def edit(self, body: bpy.types.Object) -> str:
         """The work; returns a sentence to report.

@@ -17,6 +17,7 @@ from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
 from ..scene.armature import ROLES_KEY
+from ..scene.standing import curves_of
 
 UNIFORM = 1e-3  # relative tolerance between the scales along the axes
 RESIDUAL_KEY = "tricap_unshown"  # custom property of an action: its residual motion, and a digest of the keys that it belongs to
@@ -244,8 +245,7 @@ def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action 
 def keys_digest(action: bpy.types.Action) -> str:
     """A digest of the frames and values of all keys of an action."""
     total = hashlib.sha256()
-    curves = [curve for layer in action.layers for strip in layer.strips for bag in strip.channelbags for curve in bag.fcurves]
-    for curve in sorted(curves, key=lambda curve: (curve.data_path, curve.array_index)):
+    for curve in sorted(curves_of(action), key=lambda curve: (curve.data_path, curve.array_index)):
         keys = np.empty(2 * len(curve.keyframe_points), dtype=np.float32)
         curve.keyframe_points.foreach_get("co", keys)
         total.update(f"{curve.data_path} {curve.array_index}".encode() + keys.tobytes())

@@ -128,5 +128,14 @@ def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:
     strips = [strip.action for track in data.nla_tracks for strip in track.strips] if data is not None else []
     actions = {action for action in (data.action if data is not None else None, *strips) if action is not None}
     paths = (OBJECT_PATH, body.pose.bones[ROOT].path_from_id("location"))
-    bags = [bag for action in actions for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
-    return [curve for bag in bags for curve in bag.fcurves if curve.data_path in paths and curve.array_index < 2]
+    return [curve for action in actions for curve in curves_of(action) if curve.data_path in paths and curve.array_index < 2]
+
+
+def bags_of(action: bpy.types.Action) -> list[bpy.types.ActionChannelbag]:
+    """The bags with the curves of an action, one for each slot."""
+    return [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
+
+
+def curves_of(action: bpy.types.Action) -> list[bpy.types.FCurve]:
+    """All curves of an action."""
+    return [curve for bag in bags_of(action) for curve in bag.fcurves]

@@ -3,8 +3,10 @@
 In the window, the check begins by itself when footage and cameras are there and nothing else runs; it gives way to any other job.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -27,6 +29,32 @@ GOOD = "No problems found."
 LOOK_S = 2.0  # between two looks whether a check should begin by itself
 
 
+@dataclass(frozen=True, kw_only=True)
+class Mends:
+    """What a check found that a press mends; empty where it found nothing."""
+
+    late_frames: Mapping[str, int] = field(default_factory=dict)  # the delay of each view
+    camera_of: Mapping[str, str] = field(default_factory=dict)  # the camera that fits each view, where views are swapped
+    first_field: str = ""  # where combing was found
+
+
+def mends_of(checked: Checked) -> Mends:
+    """What can be mended of the findings."""
+    offsets: Any = checked.figures.get("offsets", {})
+    by_cause = {finding.cause: finding.figures for finding in checked.findings}
+    return Mends(
+        late_frames={view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None},
+        camera_of=by_cause.get(Cause.SWAPPED_VIEWS, {}).get("camera_of", {}),
+        first_field=str(by_cause[Cause.COMBING]["first_field"] or "odd") if Cause.COMBING in by_cause else "",
+    )
+
+
+def found(scene: bpy.types.Scene) -> Mends:
+    """What the last check of the scene's input found in this session."""
+    mends: Mends = get_session().file.mends.get(scene.tricap.check_key, Mends())
+    return mends
+
+
 class Check(JobOperator, bpy.types.Operator):
     """Check whether the footage is synchronized, the cameras fit it, views are swapped, and the clothes have enough texture"""
 
@@ -47,13 +75,7 @@ class Check(JobOperator, bpy.types.Operator):
         props.check_said = "\n".join(str(finding) for finding in result.findings) or GOOD
         props.check_passed = not result.findings
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
-        offsets = result.figures.get("offsets", {})
-        late = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
-        file = get_session().file
-        file.late_frames[props.check_key] = late
-        by_cause = {finding.cause: finding.figures for finding in result.findings}
-        file.camera_of[props.check_key] = dict(by_cause.get(Cause.SWAPPED_VIEWS, {}).get("camera_of", {}))
-        file.fields_found[props.check_key] = str(by_cause[Cause.COMBING]["first_field"] or "odd") if Cause.COMBING in by_cause else ""
+        get_session().file.mends[props.check_key] = mends_of(result)
         context.window_manager.tricap_steps.cameras = context.window_manager.tricap_steps.cameras or not props.check_passed
         for line in props.check_said.splitlines():
             self.report({"INFO" if props.check_passed else "WARNING"}, line)
@@ -70,11 +92,11 @@ class SetOffsets(SimpleOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only after a check in this session that found offsets."""
-        return any(get_session().file.late_frames.get(context.scene.tricap.check_key, {}).values())
+        return any(found(context.scene).late_frames.values())
 
     def do(self, context: bpy.types.Context) -> str:
         """Set them."""
-        late = get_session().file.late_frames[context.scene.tricap.check_key]
+        late = found(context.scene).late_frames
         for view in context.scene.tricap.views:
             view.offset_frames -= late.get(view.name, 0)
         return "Offsets: " + ", ".join(f"{view.name} {view.offset_frames}" for view in context.scene.tricap.views)
@@ -92,15 +114,14 @@ class MatchNames(SimpleOperator, bpy.types.Operator):
         """Only after a check in this session that found swapped views, or where a view has no camera."""
         now = get_session().file.step_states.get(context.scene.name_full)
         unnamed = now is not None and now.states["cameras"].fix == states.Fix.MATCH_NAMES
-        return unnamed or bool(get_session().file.camera_of.get(context.scene.tricap.check_key))
+        return unnamed or bool(found(context.scene).camera_of)
 
     def do(self, context: bpy.types.Context) -> str:
         """Rename the cameras in rig.toml; the bar stays with them."""
         path = project.take(context.scene).rig_path
         rig = read_rig(path)
         names = names_for_views(rig, [view.name for view in context.scene.tricap.views])
-        camera_of = get_session().file.camera_of.get(context.scene.tricap.check_key, {})
-        names = names or {camera: view for view, camera in camera_of.items() if view != camera}
+        names = names or {camera: view for view, camera in found(context.scene).camera_of.items() if view != camera}
         use_rig(context.scene, renamed(rig, names), read_bar(path, rig))
         return "Cameras: " + ", ".join(f"{camera} is {view} now" for camera, view in names.items()) + "."
 
@@ -115,12 +136,12 @@ class SetFields(SimpleOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only after a check in this session that found combing."""
-        return bool(get_session().file.fields_found.get(context.scene.tricap.check_key))
+        return bool(found(context.scene).first_field)
 
     def do(self, context: bpy.types.Context) -> str:
         """Set them, and show the fields."""
         props = context.scene.tricap
-        first = get_session().file.fields_found[props.check_key]
+        first = found(context.scene).first_field
         before = props.interlaced, props.first_field
         props.interlaced, props.first_field = BOTH, first
         try:

@@ -12,35 +12,21 @@ from ...core.images.sequence import open_sequence
 from ...core.take.footage_files import copy_take, find_footage, find_moved, name_views, take_files
 from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
-from ..panels import sentence
+from ..panels import TellingOperator, sentence
 from . import watch
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-class SimpleOperator:
-    """Mix-in: `do` is the work; an error is reported in its sentence, and the steps' states are computed again."""
+class SimpleOperator(TellingOperator):
+    """Mix-in: the steps' states are computed again after the work."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Do it."""
         try:
-            message = self.do(context)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
-            return {"CANCELLED"}
+            return super().execute(context)
         finally:
             watch.refresh(context.scene)
-        if message:
-            self.report({"INFO"}, message)  # type: ignore[attr-defined]
-        return {"FINISHED"}
-
-    def do(self, context: bpy.types.Context) -> str:
-        """The work; returns a sentence to report, or "".
-
-        Raises:
-            InputError: it cannot be done; nothing was changed.
-        """
-        raise NotImplementedError
 
 
 class AddFootage(SimpleOperator, bpy.types.Operator):

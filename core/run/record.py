@@ -204,13 +204,15 @@ class FrameTable:
         return badness, tuple(reasons)
 
 
-def doubtful_stretches(table: FrameTable) -> list[tuple[int, int, str]]:
-    """First and last frame of every run of doubtful frames, with the reason of the worst one.
-
-    A state of the fit that most frames share does not single out a frame.
-    """
+def _badness(table: FrameTable) -> tuple[np.ndarray, tuple[str, ...]]:
+    """`FrameTable.badness`, where a state of the fit that most frames share does not single out a frame."""
     usual = {state for state in table.fit if 2 * table.fit.count(state) > len(table.fit)}
-    badness, reasons = replace(table, fit=tuple("" if state in usual else state for state in table.fit)).badness()
+    return replace(table, fit=tuple("" if state in usual else state for state in table.fit)).badness()
+
+
+def doubtful_stretches(table: FrameTable) -> list[tuple[int, int, str]]:
+    """First and last frame of every run of doubtful frames, with the reason of the worst one."""
+    badness, reasons = _badness(table)
     found: list[tuple[int, int, str, float]] = []
     for frame, bad, reason in zip(table.frames.tolist(), badness.tolist(), reasons):
         if not reason:
@@ -246,31 +248,26 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
 
 def doubtful_frames(table: FrameTable, body: BodyFit | None) -> dict[int, str]:
     """Why frames are doubtful, the worst first: those in which the images contradict a limb or do not show where it is, then those worse
-    than the median frame.
-
-    A state of the fit that most frames share does not single out a frame.
-    """
-    usual = {state for state in table.fit if 2 * table.fit.count(state) > len(table.fit)}
-    table = replace(table, fit=tuple("" if state in usual else state for state in table.fit))
+    than the median frame."""
     contradicted: dict[int, list[str]] = {}
     for bone, frames in body.contradicted.items() if body is not None else ():
         for frame in frames:
             contradicted.setdefault(int(frame), []).append(limb_name(bone))
     found = {frame: f"the images contradict the {' and the '.join(limbs)}" for frame, limbs in contradicted.items()}
-    for frame, limbs in _guessed(body).items():
+    for frame, limbs in _guessed(body).items() if body is not None else ():
         found.setdefault(frame, f"the {' and the '.join(limbs)} {'are' if len(limbs) > 1 else 'is'} guessed")
-    badness, reasons = table.badness()
+    badness, reasons = _badness(table)
     for t in np.argsort(-badness, kind="stable").tolist():
         if reasons[t]:
             found.setdefault(int(table.frames[t]), reasons[t])
     return found
 
 
-def _guessed(body: BodyFit | None) -> dict[int, list[str]]:
+def _guessed(body: BodyFit) -> dict[int, list[str]]:
     """The limbs that are guessed, by frame."""
     found: dict[int, list[str]] = {}
-    for limb, row in limb_words(body.motion.joint_names, body.motion.known).items() if body is not None else ():
-        for frame in guessed_frames(body.motion.frames.tolist(), row) if body is not None else ():
+    for limb, row in limb_words(body.motion.joint_names, body.motion.known).items():
+        for frame in guessed_frames(body.motion.frames.tolist(), row):
             found.setdefault(frame, []).append(limb)
     return found
 

@@ -556,12 +556,12 @@ def test_the_check_is_kept_until_its_input_changes(blender: ModuleType, words: W
     words()
     assert said and said[0].split()[0] in " ".join(layout.draw(panel.TRICAP_PT_main, blender.context).texts)
     assert "tricap.mend_offsets" not in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
-    late = importlib.import_module(f"{NAME}.session").get_session().file.late_frames
-    late[scene.tricap.check_key] = {"L": 0, "C": 0, "R": 1}
+    mends = importlib.import_module(f"{NAME}.session").get_session().file.mends
+    mends[scene.tricap.check_key] = check.Mends(late_frames={"L": 0, "C": 0, "R": 1})
     assert "tricap.mend_offsets" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
     assert blender.ops.tricap.mend_offsets() == {"FINISHED"}
     assert [view.offset_frames for view in scene.tricap.views] == [0, 0, -1]
-    assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in late
+    assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in mends
 
 
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])
@@ -715,7 +715,8 @@ def test_what_the_check_finds_is_mended_by_a_press(blender: ModuleType, words: W
     assert {camera.name: camera.t_cam_world_m.tolist() for camera in read_rig(path).cameras} == {n: t.tolist() for n, t in true.items()}
     assert not blender.ops.tricap.set_fields.poll()
     words()
-    importlib.import_module(f"{NAME}.session").get_session().file.fields_found[scene.tricap.check_key] = "even"
+    check, session = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.check", "session"))
+    session.get_session().file.mends[scene.tricap.check_key] = check.Mends(first_field="even")
     assert blender.ops.tricap.set_fields() == {"FINISHED"}
     assert (scene.tricap.interlaced, scene.tricap.first_field) == ("both", "even") and scene.frame_end == 5
 
