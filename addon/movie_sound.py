@@ -23,7 +23,8 @@ def movie_sound(path: Path) -> Sound | None:
         raise InputError(f"Cannot read the movie {path}: {error.strerror or error}.") from error
     try:
         sound = aud.Sound(str(path)).rechannel(1)
-        samples, rate = sound.data(), sound.specs[0]
+        rate = sound.specs[0]  # first: in Blender 4.5, data() of a file without sound ends the process
+        samples = sound.data()
     except aud.error:
         return None
     return sound_of(samples, round(rate)) if len(samples) else None
