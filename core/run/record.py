@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..body.limb_words import FEW_FRAMES, counts, guessed_frames, limb_words
-from ..body.motion import FITTED, PARTIAL, BodyFit
+from ..body.motion import FITTED, PARTIAL, SEEN, BodyFit
 from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
@@ -101,6 +101,7 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
     return figures | ({"silhouettes": silhouettes} if silhouettes else {}) | ({"tracked_again": tracked_again} if tracked_again else {})
 
 
+LEAST_SEEN = 0.5  # of the frames
 LIMBS = {"upper_arm": "arm", "forearm": "forearm", "thigh": "leg", "shin": "lower leg"}
 
 
@@ -122,17 +123,22 @@ def frame_states(body: BodyFit) -> dict[str, int]:
 
 
 def fit_warnings(body: BodyFit) -> list[str]:
-    """What is doubtful about the fit as a whole: frames that rest on prediction, limbs that are guessed or contradicted, an adjustment that
-    did not converge."""
+    """What is doubtful about the fit as a whole: frames that rest on prediction, limbs that are guessed, contradicted or seldom seen, an
+    adjustment that did not converge."""
     motion = body.motion
     predicted = ", ".join(f"{n} {word}" for word, n in frame_states(body).items() if word not in (FITTED, PARTIAL))
     warnings = [f"Frames in which the body rests on prediction: {predicted}."] if predicted else []
     for limb, row in limb_words(motion.joint_names, motion.known).items():
-        frames = guessed_frames(motion.frames.tolist(), row)
+        frames, seen = guessed_frames(motion.frames.tolist(), row), row.count(SEEN)
         if len(frames) > FEW_FRAMES:
             warnings.append(
                 f"The place of the {limb} is guessed in {len(frames)} frames ({frame_list(frames)}), for the images do not show where it "
                 "is: look at it there, and click its joints in one of these frames."
+            )
+        elif seen < LEAST_SEEN * len(row) and len(row) - seen > FEW_FRAMES:
+            warnings.append(
+                f"The {limb} is seen well in {seen} of {len(row)} frames only, and inferred in the others: look at it, and click its "
+                "joints where it is wrong."
             )
     for bone, frames in body.contradicted.items():
         if len(frames) > FEW_FRAMES:

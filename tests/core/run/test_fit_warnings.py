@@ -22,10 +22,17 @@ def test_a_limb_that_the_images_contradict_is_named_with_its_frames() -> None:
 
 
 def test_a_limb_that_is_guessed_is_named_with_its_frames() -> None:
-    rows = lambda n: (("seen", "guessed"),) * n + (("inferred", "seen"),) * (30 - n)  # noqa: E731
+    rows = lambda n: (("seen", "guessed"),) * n + (("seen", "seen"),) * (30 - n)  # noqa: E731
     (warning,) = fit_warnings(_body({}, rows(FEW_FRAMES + 1)))
     assert f"The place of the left arm is guessed in {FEW_FRAMES + 1} frames (0–{FEW_FRAMES})" in warning
     assert fit_warnings(_body({}, rows(FEW_FRAMES))) == []
+
+
+def test_a_limb_that_is_seldom_seen_is_named() -> None:
+    rows = lambda n: (("seen", "seen"),) * n + (("inferred", "seen"),) * (30 - n)  # noqa: E731
+    (warning,) = fit_warnings(_body({}, rows(14)))
+    assert "The left arm is seen well in 14 of 30 frames only" in warning
+    assert fit_warnings(_body({}, rows(15))) == []
 
 
 @pytest.mark.parametrize(("bone", "words"), [("upper_arm.L", "left arm"), ("thigh.R", "right leg"), ("tail_tip", "tail tip")])
