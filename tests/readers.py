@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scene_files import model, record, write_fbx, write_gltf, zeros
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
@@ -26,6 +27,8 @@ from tricap.core.images.interlace import row_grid
 from tricap.core.images.sequence import open_sequence
 from tricap.core.motion import tables
 from tricap.core.motion.formats import bvh, c3d, keypoints_json, markers, trc
+from tricap.core.motion.formats.fbx import check_fbx
+from tricap.core.motion.formats.gltf import check_gltf
 from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.ply import read_ply, write_cloud, write_mesh
 from tricap.core.motion.retarget.mapping import read_preset
@@ -376,6 +379,10 @@ READERS: dict[str, tuple[Make, Read]] = {
     "keypoints of OpenPose": (written("a.json", person), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "keypoints of COCO": (written("a.json", coco), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "vrm": (written("a.vrm", glb), lambda f: read_humanoid(f / "a.vrm")),
+    "fbx before Blender": (written("a.fbx", lambda p: write_fbx(p, [model(1), record(b"Geometry", [zeros(90)], [model(2)])])),
+                           lambda f: check_fbx(f / "a.fbx")),
+    "gltf before Blender": (written("a.gltf", lambda p: write_gltf(p, nodes=[{"name": "a", "mesh": 0}, {"name": "b"}])),
+                            lambda f: check_gltf(f / "a.gltf")),
     **{f"picture {ending[1:]}": picture(ending) for ending in (".png", ".jpg", ".tif", ".bmp", ".webp", ".pgm")},
     "picture png 16 bit colour": picture(".png", np.uint16, (24, 32, 3)),
     "movie avi": movie(".avi", "MJPG"),

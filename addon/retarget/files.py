@@ -13,6 +13,8 @@ from ...core.foundation import bounded
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.bvh import read_bvh
+from ...core.motion.formats.fbx import check_fbx
+from ...core.motion.formats.gltf import check_gltf
 from ...core.motion.retarget.mapping import MappedMotion, find_map
 from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
@@ -82,19 +84,20 @@ def import_rig(path: Path) -> list[bpy.types.Object]:
     """
     before = set(bpy.data.objects)
     kind = path.suffix.lower()
-    if kind == ".vrm":
+    humanoid: dict[str, str] = {}
+    if kind in (".glb", ".gltf", ".vrm"):
+        check_gltf(path)
         humanoid = read_humanoid(path)
+    if kind == ".vrm":
         with tempfile.TemporaryDirectory() as folder:
             shutil.copy(path, Path(folder) / f"{path.stem}.glb")
             _try(lambda: bpy.ops.import_scene.gltf(filepath=str(Path(folder) / f"{path.stem}.glb")), path)
     elif kind in (".glb", ".gltf"):
-        humanoid = read_humanoid(path) if kind == ".glb" else {}
         _try(lambda: bpy.ops.import_scene.gltf(filepath=str(path)), path)
     elif kind == ".fbx":
-        humanoid = {}
+        check_fbx(path)
         _try(lambda: bpy.ops.import_scene.fbx(filepath=str(path)), path)
     else:
-        humanoid = {}
         _rig_of_bvh(path)
     armatures = [o for o in bpy.data.objects if o not in before and o.type == "ARMATURE"]
     for armature_object in armatures:

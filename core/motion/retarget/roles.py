@@ -13,15 +13,12 @@ these are second guesses, for parts without a bone of an unambiguous name.
 The roles of bones in a VRM file: the humanoid table in the JSON of a binary glTF file (VRM 0.x and 1.0 specifications).
 """
 
-import os
 import re
-import struct
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...foundation import bounded
-from ...foundation.errors import InputError
+from ..formats.gltf import DAMAGE, read_table, unreadable
 
 SIDES = ("L", "R")
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
@@ -230,21 +227,17 @@ def read_humanoid(path: Path) -> dict[str, str]:
     """Names of nodes by role; empty for a glTF file that is no VRM.
 
     Raises:
-        InputError: it cannot be read or is no binary glTF file.
+        InputError: it cannot be read or is no glTF file.
     """
+    table = read_table(path)
     try:
-        with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
-            magic, _, _, length, kind = struct.unpack("<4sIII4s", file.read(20))
-            if magic != b"glTF" or kind != b"JSON" or length > min(bounded.JSON_BYTES, os.fstat(file.fileno()).st_size):
-                raise InputError(f"{path} is not a binary glTF file or is damaged; export it again.")
-            table = bounded.json_of(file.read(length))
         nodes, extensions = table.get("nodes", []), table.get("extensions", {})
         bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
         pairs = [(row["bone"], row["node"]) for row in bones]
         pairs += [(bone, row["node"]) for bone, row in extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {}).items()]
         return {role: nodes[node]["name"] for bone, node in pairs if (role := role_of(bone)) and "name" in nodes[node]}
-    except (OSError, ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is not a VRM or glTF file that can be read ({error}); export it again.") from error
+    except DAMAGE as error:
+        raise unreadable(path, error) from error
 
 
 def role_of(bone: str) -> str:

@@ -1,0 +1,117 @@
+"""FBX: what Blender's importer would make of a binary file, counted before it does. The file itself is read by Blender.
+
+The importer trusts what a file says of itself: it makes a list for as many values as a record claims to have, and unpacks arrays of any
+length, so that 900 kB can become 2 GB. Layout of the records: A. Gessler, "FBX binary file format specification", Blender developers' blog
+(2013); from version 7500 on, with words of 64 bits.
+"""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+from ...foundation import bounded
+from ...foundation.errors import InputError
+
+MAGIC = b"Kaydara FBX Binary  \0\x1a\0"
+WIDE_FROM = 7500  # the version from which words have 64 bits
+SINGLE = {"Z": 1, "Y": 2, "B": 1, "C": 1, "I": 4, "F": 4, "D": 8, "L": 8}  # bytes of a value, by its kind
+ARRAYS = {"b": 1, "c": 1, "i": 4, "l": 8, "f": 4, "d": 8}  # bytes of an element
+TEXTS = "RS"
+DEEPEST = 64  # records in each other
+MOST_OBJECTS = 5_000  # models, meshes, materials, …: whatever becomes a thing of Blender's
+MANY = ("AnimationCurve", "AnimationCurveNode", "Deformer", "NodeAttribute")  # are parts of others
+MOST_UNPACKED = 100_000_000  # bytes
+MOST_RATIO = 100  # times its size, for larger files
+PIECE = 1 << 20
+
+
+def check_fbx(path: Path) -> None:
+    """Check that a file does not ask for far more than it contains. One that is not binary is left to Blender, which refuses it.
+
+    Raises:
+        InputError: it does, or is damaged.
+    """
+    try:
+        with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                _Walk(file, path).all()
+    except (OSError, ValueError, struct.error, zlib.error, RecursionError) as error:
+        raise InputError(f"{path} is not an FBX file that can be read ({error}); it is damaged, export it again.") from error
+
+
+class _Walk:
+    """One passage through the records of a file, with what was counted so far."""
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        self._file, self._path = file, path
+        self._size = path.stat().st_size
+        self._unpacked = self._objects = 0
+
+    def all(self) -> None:
+        """Every record of the file."""
+        (version,) = self._read("<I")
+        self._head = "<QQQB" if version >= WIDE_FROM else "<IIIB"
+        while self._record(self._size, 0, ""):
+            pass
+
+    def _read(self, layout: str) -> tuple[int, ...]:
+        return struct.unpack(layout, self._file.read(struct.calcsize(layout)))
+
+    def _record(self, room_to: int, depth: int, parent: str) -> bool:
+        """One record and those in it; whether there was one."""
+        end, values, _, length = self._read(self._head)
+        if end == 0:
+            return False
+        name = self._file.read(length).decode("latin-1")
+        if depth > DEEPEST or end > room_to or values > end - self._file.tell():
+            raise ValueError("a record that does not fit into the file")
+        self._objects += parent == "Objects" and name not in MANY
+        if self._objects > MOST_OBJECTS:
+            raise InputError(f"{self._path} has more than {MOST_OBJECTS} objects; export the rig alone.")
+        for _ in range(values):
+            self._value(end)
+        while self._file.tell() < end and self._record(end, depth + 1, name):
+            pass
+        if self._file.tell() != end:
+            raise ValueError("a record that does not end where it claims to")
+        return True
+
+    def _value(self, end: int) -> None:
+        kind = self._file.read(1).decode("latin-1")
+        if kind in ARRAYS:
+            count, packed, length = self._read("<III")
+            self._fits(length, end)
+            self._array(count * ARRAYS[kind], self._file.read(length), packed == 1)
+        elif kind and kind in TEXTS:
+            (length,) = self._read("<I")
+            self._fits(length, end)
+            self._file.seek(length, 1)
+        elif kind in SINGLE:
+            self._file.seek(SINGLE[kind], 1)
+        else:
+            raise ValueError("a value of an unknown kind")
+
+    def _fits(self, length: int, end: int) -> None:
+        if self._file.tell() + length > end:
+            raise ValueError("a value that does not fit into its record")
+
+    def _array(self, claimed: int, data: bytes, packed: bool) -> None:
+        """Count the bytes of an array: what it claims, and what it unpacks to, which need not be the same."""
+        self._unpacked += claimed
+        if self._unpacked > max(MOST_UNPACKED, MOST_RATIO * self._size):
+            raise InputError(f"{self._path} would unpack to more than {self._unpacked / 1e9:.1f} GB; it is damaged, export it again.")
+        found = _unpacked_size(data, claimed) if packed else len(data)
+        if found != claimed:
+            raise ValueError("an array whose length is not as it claims")
+
+
+def _unpacked_size(data: bytes, most: int) -> int:
+    """The bytes to which zlib data unpack, counted up to a little more than `most`; they are not kept."""
+    unpacker, total = zlib.decompressobj(), 0
+    while total <= most and not unpacker.eof:
+        piece = unpacker.decompress(data, PIECE)
+        if not piece:
+            break
+        data, total = unpacker.unconsumed_tail, total + len(piece)
+    return total

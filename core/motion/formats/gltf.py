@@ -1,0 +1,123 @@
+"""glTF 2.0 and VRM: the JSON part, and what Blender's importer would make of a file, counted before it does (Khronos, glTF 2.0, 2021).
+
+The importer trusts what a file says of itself: an accessor without data is zeros of any number, one accessor may be used by any number of
+meshes, every node becomes an object, and a buffer may lie in any file, also one that never ends. A file of 300 bytes can ask for
+gigabytes. No honest one of its size does.
+"""
+
+import math
+import os
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from ...foundation import bounded
+from ...foundation.errors import InputError
+
+MOST_NODES = 10_000  # and instances, each of which becomes an object
+MOST_VALUES = 10_000_000  # of all accessors, as often as they are used
+VALUES_PER_BYTE = 20  # for larger files
+VALUES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+DAMAGE = (OSError, ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError)
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The JSON part of a binary file (.glb, .vrm), or the JSON file (.gltf).
+
+    Raises:
+        InputError: it cannot be read or is no glTF file.
+    """
+    try:
+        with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
+            head, size = file.read(20), os.fstat(file.fileno()).st_size
+            if head[:4] == b"glTF":
+                length, kind = struct.unpack("<I4s", head[12:])
+                if kind != b"JSON" or length > min(bounded.JSON_BYTES, size):
+                    raise ValueError("its first part is not JSON, or longer than the file")
+                table = bounded.json_of(file.read(length))
+            elif path.suffix.lower() != ".gltf":
+                raise ValueError("it is not a binary glTF file")
+            else:
+                table = bounded.json_of(bounded.bytes_of(path, bounded.JSON_BYTES))
+        if not isinstance(table, dict):
+            raise ValueError("it has no table")
+    except DAMAGE as error:
+        raise unreadable(path, error) from error
+    return table
+
+
+def unreadable(path: Path, error: Exception) -> InputError:
+    """The sentence about a file with a fault of that kind."""
+    return InputError(f"{path} is not a VRM or glTF file that can be read ({error}); export it again.")
+
+
+def check_gltf(path: Path) -> None:
+    """Check that a file does not ask for far more than it contains, nor for files outside of its folder.
+
+    Raises:
+        InputError: it does, or cannot be read.
+    """
+    table = read_table(path)
+    try:
+        _check_files(path, table)
+        nodes = table.get("nodes", [])
+        count = len(nodes) + sum(_instances(table, node) for node in nodes)
+        values = sum(_values(table, accessor) for accessor in _used(table)) + _decompressed(table)
+        most = max(MOST_VALUES, VALUES_PER_BYTE * path.stat().st_size)
+    except DAMAGE as error:
+        raise unreadable(path, error) from error
+    if count > MOST_NODES:
+        raise InputError(f"{path} has {count} nodes, more than {MOST_NODES}; export the rig alone.")
+    if values > most:
+        raise InputError(f"{path} asks for {values} numbers, far more than it contains; it is damaged, export it again.")
+
+
+def _check_files(path: Path, table: dict[str, Any]) -> None:
+    """Buffers and images in files of their own must be files in the folder of this one."""
+    for part in (*table.get("buffers", []), *table.get("images", [])):
+        uri = part.get("uri")
+        if uri is None or uri.startswith("data:"):
+            continue
+        name = Path(unquote(uri))
+        if name.is_absolute() or ".." in name.parts or ":" in uri:
+            raise InputError(f"{path} reads “{uri}”, which lies outside its folder; export it again as .glb.")
+        if (path.parent / name).exists():  # what is missing, Blender tells
+            bounded.check_file(path.parent / name, bounded.ARRAYS_BYTES)
+
+
+def _used(table: dict[str, Any]) -> list[int]:
+    """The accessors that the importer reads, as often as it reads them."""
+    used = []
+    for mesh in table.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            for named in (primitive["attributes"], *primitive.get("targets", [])):
+                used += list(named.values())
+            used += [primitive["indices"]] if "indices" in primitive else []
+    for animation in table.get("animations", []):
+        used += [animation["samplers"][channel["sampler"]][end] for channel in animation["channels"] for end in ("input", "output")]
+    return used + [skin["inverseBindMatrices"] for skin in table.get("skins", []) if "inverseBindMatrices" in skin]
+
+
+def _values(table: dict[str, Any], number: int) -> int:
+    accessor = table["accessors"][number]
+    return _count(accessor["count"]) * VALUES[accessor["type"]]
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError("a count that is none")
+    return value
+
+
+def _instances(table: dict[str, Any], node: dict[str, Any]) -> int:
+    """How often a node is repeated (EXT_mesh_gpu_instancing)."""
+    attributes = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
+    return max((_count(table["accessors"][number]["count"]) for number in attributes.values()), default=0)
+
+
+def _decompressed(table: dict[str, Any]) -> int:
+    """Numbers of four bytes in compressed views of buffers."""
+    packed = [view.get("extensions", {}).get(name) for view in table.get("bufferViews", []) for name in COMPRESSED]
+    return math.ceil(sum(_count(part["count"]) * _count(part["byteStride"]) for part in packed if part) / 4)

@@ -1,0 +1,100 @@
+"""What Blender's importers would make of a small FBX or glTF file is counted before they read it."""
+
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.motion.formats.fbx import MOST_OBJECTS, check_fbx
+from tricap.core.motion.formats.gltf import MOST_NODES, check_gltf
+
+from ...mutations import memory_mb
+from ...scene_files import model, number, record, text, write_fbx, write_gltf, zeros
+
+
+def geometry(*arrays: bytes) -> list[Any]:
+    return record(b"Geometry", [number(1), text(b"g\0\1Geometry"), text(b"Mesh")], [record(b"Vertices", [a]) for a in arrays])
+
+
+@pytest.mark.parametrize("version", [7400, 7500])
+def test_a_sound_fbx_file_is_let_through(tmp_path: Path, version: int) -> None:
+    check_fbx(write_fbx(tmp_path / "a.fbx", [model(1), geometry(zeros(300))], version))
+    (tmp_path / "text.fbx").write_text("; FBX 7.4.0 project file\n")
+    check_fbx(tmp_path / "text.fbx")  # Blender says that it reads binary files only
+
+
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        ([record(b"Model", [number(1)], claimed=400_000_000)], "does not fit into the file"),
+        ([geometry(zeros(112_500_000))], "would unpack to more than 0.9 GB"),
+        ([geometry(*[zeros(2_000_000)] * 7)], "would unpack to more than 0.1 GB"),
+        ([geometry(zeros(12_000_000, claimed=3))], "an array whose length is not as it claims"),
+        ([geometry(zeros(3, claimed=4_000_000_000))], "would unpack to more than 32.0 GB"),
+        ([model(i) for i in range(MOST_OBJECTS + 1)], "more than 5000 objects; export the rig alone"),
+        ([model(1), record(b"Model", [b"?"])], "a value of an unknown kind"),
+        ([record(b"Model", [b"S" + struct.pack("<I", 2**32 - 1)])], "a value that does not fit"),
+    ],
+)
+def test_an_fbx_file_that_asks_for_more_than_it_contains(tmp_path: Path, objects: list[Any], said: str) -> None:
+    path = write_fbx(tmp_path / "a.fbx", objects)
+    assert path.stat().st_size < 1_000_000
+    before, began = memory_mb()[1], time.process_time()
+    with pytest.raises(InputError, match=said):
+        check_fbx(path)
+    assert time.process_time() - began < 2.0 and memory_mb()[1] - before < 200
+
+
+def test_records_in_each_other(tmp_path: Path) -> None:
+    deep = model(1)
+    for _ in range(100):
+        deep = record(b"A", [], [deep])
+    with pytest.raises(InputError, match="does not fit into the file"):
+        check_fbx(write_fbx(tmp_path / "a.fbx", [deep]))
+    path = write_fbx(tmp_path / "b.fbx", [model(1)])
+    whole = path.read_bytes()
+    for cut in range(30, len(whole) - 215, 7):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(InputError, match="is not an FBX file that can be read"):
+            check_fbx(path)
+
+
+FLOATS = {"componentType": 5126, "type": "VEC3"}
+REUSED = [{"primitives": [{"attributes": {"POSITION": 0}}] * 4000}]
+GPU = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}}
+MESHOPT = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 36, "byteStride": 12, "count": 10**8}}
+
+
+@pytest.mark.parametrize("ending", [".glb", ".gltf"])
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ({"accessors": [{**FLOATS, "count": 20_000_000}]}, "asks for 60000000 numbers, far more than it contains"),
+        ({"accessors": [{**FLOATS, "count": 1000}], "meshes": REUSED}, "asks for 12000000 numbers"),
+        ({"nodes": [{"name": "a"}] * (MOST_NODES + 1)}, "10001 nodes, more than 10000"),
+        ({"nodes": [GPU], "accessors": [{**FLOATS, "count": 10**6}]}, "1000001 nodes"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 36, "extensions": MESHOPT}]}, "asks for 300000009 numbers"),
+        ({"buffers": [{"byteLength": 36, "uri": "/dev/zero"}]}, "“/dev/zero”, which lies outside its folder"),
+        ({"images": [{"uri": "../a.png"}]}, "outside its folder"),
+        ({"images": [{"uri": "%2E%2E/a.png"}]}, "outside its folder"),
+        ({"buffers": [{"byteLength": 36, "uri": "file:///etc/hostname"}]}, "outside its folder"),
+        ({"buffers": [{"byteLength": 36, "uri": "pipe"}]}, "is not a VRM or glTF file that can be read"),
+        ({"nodes": 7}, "is not a VRM or glTF file that can be read"),
+        ({"accessors": [{**FLOATS, "count": -1}]}, "a count that is none"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 9}}]}]}, "is not a VRM or glTF"),
+    ],
+)
+def test_a_gltf_file_that_asks_for_more_than_it_contains(tmp_path: Path, ending: str, parts: dict[str, Any], said: str) -> None:
+    (tmp_path / "pipe").mkdir()
+    with pytest.raises(InputError, match=said):
+        check_gltf(write_gltf(tmp_path / f"a{ending}", **parts))
+
+
+def test_a_sound_gltf_file_is_let_through(tmp_path: Path) -> None:
+    (tmp_path / "a é.bin").write_bytes(b"\0" * 36)
+    for uri in ("a%20%C3%A9.bin", "data:application/octet-stream;base64,AAAA", "missing.bin"):
+        check_gltf(write_gltf(tmp_path / "a.gltf", buffers=[{"byteLength": 36, "uri": uri}]))
+    check_gltf(write_gltf(tmp_path / "a.glb"))
