@@ -18,7 +18,8 @@ import pytest
 
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import LONGEST, InputError
-from tricap.core.images.sequence import claimed_size, read_image
+from tricap.core.images.headers import claimed_size
+from tricap.core.images.sequence import read_image
 from tricap.core.motion.formats.keypoints_json import natural_order, read_keypoints
 from tricap.core.motion.tables import read_joints
 from tricap.core.results.folder import PARENTS, WRITTEN, Results

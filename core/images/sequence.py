@@ -1,11 +1,10 @@
 """Image sequences of a camera: image files or a movie, with grey values as float32 in the range 0…255.
 
-Files are read on demand, so a long sequence needs no more memory than a short one. The size of an image is read from its header before it
-is decoded, because a small file must not unpack to gigabytes.
+Files are read on demand, so a long sequence needs no more memory than a short one. The size of an image is read from its header before
+it is decoded.
 """
 
 import re
-import struct
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,93 +13,8 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.errors import InputError
-
-JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers with the size
-TIFF_KINDS = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4), 16: ("Q", 8)}
-MOST_ENTRIES = 4096  # of a TIFF directory
-
-
-def claimed_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) in the header of an image file; None if it is damaged or of an unknown kind."""
-    for first, reader in READERS:
-        if data.startswith(first):
-            try:
-                return reader(data)
-            except (struct.error, IndexError, ValueError):
-                return None
-    return None
-
-
-def _png(data: bytes) -> tuple[int, int] | None:
-    """OpenCV allocates the claimed length of each chunk, so the chunks must lie within the file."""
-    w, h = struct.unpack(">II", data[16:24])
-    at = 8
-    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
-        at += 12 + struct.unpack(">I", data[at : at + 4])[0]
-    return (w, h) if data[12:16] == b"IHDR" and at < len(data) else None
-
-
-def _jpeg(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 < len(data):
-        if data[at] != 0xFF:
-            return None
-        marker = data[at + 1]
-        if marker in JPEG_FRAMES:
-            h, w = struct.unpack(">HH", data[at + 5 : at + 9])
-            return w, h
-        at += 1 if marker == 0xFF else 2 if marker in (0x01, *range(0xD0, 0xDA)) else 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
-    return None
-
-
-def _bmp(data: bytes) -> tuple[int, int]:
-    if struct.unpack("<I", data[14:18])[0] == 12:
-        w, h = struct.unpack("<HH", data[18:22])
-        return w, h
-    w, h = struct.unpack("<ii", data[18:26])
-    return abs(w), abs(h)
-
-
-def _portable(data: bytes) -> tuple[int, int]:
-    words = re.sub(rb"#[^\n]*", b" ", data[2:4096]).split()
-    return int(words[0]), int(words[1])
-
-
-def _webp(data: bytes) -> tuple[int, int] | None:
-    kind = data[12:16]
-    if kind == b"VP8X":
-        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    if kind == b"VP8L":
-        bits = struct.unpack("<I", data[21:25])[0]
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if kind == b"VP8 ":
-        w, h = struct.unpack("<HH", data[26:30])
-        return w & 0x3FFF, h & 0x3FFF
-    return None
-
-
-def _tiff(data: bytes) -> tuple[int, int] | None:
-    """The largest size in the first directory of a classic or big TIFF."""
-    order = "<" if data[:1] == b"I" else ">"
-    big = struct.unpack(order + "H", data[2:4])[0] == 43
-    at = struct.unpack(order + ("Q" if big else "I"), data[8:16] if big else data[4:8])[0]
-    count = struct.unpack(order + ("Q" if big else "H"), data[at : at + (8 if big else 2)])[0]
-    at, step, value = at + (8 if big else 2), 20 if big else 12, 12 if big else 8
-    found = {256: 0, 257: 0}
-    for i in range(min(count, MOST_ENTRIES)):
-        tag, kind = struct.unpack(order + "HH", data[at + i * step : at + i * step + 4])
-        if tag in found and kind in TIFF_KINDS:
-            code, size = TIFF_KINDS[kind]
-            place = at + i * step + value
-            found[tag] = max(found[tag], struct.unpack(order + code, data[place : place + size])[0])
-    return (found[256], found[257]) if all(found.values()) else None
-
-
-READERS = (
-    (b"\x89PNG\r\n\x1a\n", _png), (b"\xff\xd8\xff", _jpeg), (b"BM", _bmp), (b"RIFF", _webp), (b"II", _tiff), (b"MM", _tiff),
-    *((kind, _portable) for kind in (b"P2", b"P3", b"P5", b"P6")),
-)  # fmt: skip
-
+from .headers import claimed_size
+from .packets import PacketSizes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
@@ -122,6 +36,10 @@ SIGNATURES = (
 OPEN_EXR = b"\x76\x2f\x31\x01"
 MOVIE_SIGNATURES = (b"RIFF", b"\x1a\x45\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"\x47")  # AVI, Matroska, MPEG: program, video, transport
 MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # one of them begins an MP4 or QuickTime file
+MARKED = (
+    "{path} is marked as interlaced, and such movies cannot be decoded here; take the mark away, which keeps its fields as they are: "
+    "ffmpeg -i {name} -vf setfield=prog -c:v ffv1 new.mkv"
+)
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
 WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
@@ -203,12 +121,16 @@ class Movie:
         self._capture = _capture(path)
         self._next, self._last = 0, np.zeros(0)
         self._shown_ms: dict[int, float] = {}
+        self._sizes = PacketSizes(path)
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
             raise InputError(NO_MOVIE.format(path=path))
         w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         _refuse_size((w, h), path)
         self._count = count
+        self._sizes.at(0)
+        if self._sizes.may_be_interlaced and count > 1:
+            self.read(0), self.read(1)
 
     @property
     def count(self) -> int:
@@ -228,14 +150,15 @@ class Movie:
         """Grey values (h, w) float32 of frame `index`; the last frame is cached.
 
         Raises:
-            InputError: the movie ends before that frame.
+            InputError: the movie ends before that frame, its pictures have another size there, or are marked as interlaced.
         """
         if index == self._next - 1 and len(self._last):
             return grey(self._last)
         if index < self._next:
             self._capture.release()
             self._capture, self._next = _capture(self._path), 0
-        image = self._last = np.zeros(0)
+        before, image = self._last, np.zeros(0)
+        self._last = image
         while self._next <= index:
             ok = self._capture.grab() if self._next < index else None
             if ok is None:
@@ -247,8 +170,20 @@ class Movie:
                 )
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
+        self._refuse_change(index)
+        if self._sizes.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
+            raise InputError(MARKED.format(path=self._path, name=self._path.name))
         self._last = image
         return grey(image)
+
+    def _refuse_change(self, index: int) -> None:
+        """The decoder would scale such pictures, so that they fit no calibration."""
+        first, now = self._sizes.at(0), self._sizes.at(index)
+        if first is not None and now is not None and now[1] != first[1]:
+            raise InputError(
+                f"From frame {now[0]} on, the pictures of {self._path} have {now[1][0]}×{now[1][1]} pixels instead of "
+                f"{first[1][0]}×{first[1][1]}. Leave out those frames with `frames` in take.toml, or cut the movie there."
+            )
 
     def read_colour(self, index: int) -> np.ndarray:
         """RGB values (h, w, 3) float32 of frame `index`; see `read`."""

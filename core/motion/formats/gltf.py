@@ -7,10 +7,10 @@ gigabytes. No honest one of its size does.
 
 import math
 import os
+import re
 import struct
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from ...foundation import bounded
 from ...foundation.errors import InputError
@@ -80,11 +80,16 @@ def _check_files(path: Path, table: dict[str, Any]) -> None:
         uri = part.get("uri")
         if uri is None or uri.startswith("data:"):
             continue
-        name = Path(unquote(uri))
+        name = Path(_unquoted(uri))
         if name.is_absolute() or ".." in name.parts or ":" in uri:
             raise InputError(f"{path} reads “{uri}”, which lies outside its folder; export it again as .glb.")
         if (path.parent / name).exists():  # what is missing, Blender tells
             bounded.check_file(path.parent / name, bounded.ARRAYS_BYTES)
+
+
+def _unquoted(uri: str) -> str:
+    """A reference with its %XX as characters (RFC 3986, 2.1)."""
+    return re.sub(rb"%([0-9A-Fa-f]{2})", lambda m: bytes([int(m[1], 16)]), uri.encode()).decode(errors="replace")
 
 
 def _used(table: dict[str, Any]) -> list[int]:

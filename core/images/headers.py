@@ -1,0 +1,90 @@
+"""The size in the header of an image file, read before it is decoded: a small file must not unpack to gigabytes."""
+
+import re
+import struct
+
+JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers with the size
+TIFF_KINDS = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4), 16: ("Q", 8)}
+MOST_ENTRIES = 4096  # of a TIFF directory
+
+
+def claimed_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) in the header of an image file; None if it is damaged or of an unknown kind."""
+    for first, reader in READERS:
+        if data.startswith(first):
+            try:
+                return reader(data)
+            except (struct.error, IndexError, ValueError):
+                return None
+    return None
+
+
+def _png(data: bytes) -> tuple[int, int] | None:
+    """OpenCV allocates the claimed length of each chunk, so the chunks must lie within the file."""
+    w, h = struct.unpack(">II", data[16:24])
+    at = 8
+    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+        at += 12 + struct.unpack(">I", data[at : at + 4])[0]
+    return (w, h) if data[12:16] == b"IHDR" and at < len(data) else None
+
+
+def _jpeg(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 < len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker in JPEG_FRAMES:
+            h, w = struct.unpack(">HH", data[at + 5 : at + 9])
+            return w, h
+        at += 1 if marker == 0xFF else 2 if marker in (0x01, *range(0xD0, 0xDA)) else 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
+    return None
+
+
+def _bmp(data: bytes) -> tuple[int, int]:
+    if struct.unpack("<I", data[14:18])[0] == 12:
+        w, h = struct.unpack("<HH", data[18:22])
+        return w, h
+    w, h = struct.unpack("<ii", data[18:26])
+    return abs(w), abs(h)
+
+
+def _portable(data: bytes) -> tuple[int, int]:
+    words = re.sub(rb"#[^\n]*", b" ", data[2:4096]).split()
+    return int(words[0]), int(words[1])
+
+
+def _webp(data: bytes) -> tuple[int, int] | None:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if kind == b"VP8L":
+        bits = struct.unpack("<I", data[21:25])[0]
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if kind == b"VP8 ":
+        w, h = struct.unpack("<HH", data[26:30])
+        return w & 0x3FFF, h & 0x3FFF
+    return None
+
+
+def _tiff(data: bytes) -> tuple[int, int] | None:
+    """The largest size in the first directory of a classic or big TIFF."""
+    order = "<" if data[:1] == b"I" else ">"
+    big = struct.unpack(order + "H", data[2:4])[0] == 43
+    at = struct.unpack(order + ("Q" if big else "I"), data[8:16] if big else data[4:8])[0]
+    count = struct.unpack(order + ("Q" if big else "H"), data[at : at + (8 if big else 2)])[0]
+    at, step, value = at + (8 if big else 2), 20 if big else 12, 12 if big else 8
+    found = {256: 0, 257: 0}
+    for i in range(min(count, MOST_ENTRIES)):
+        tag, kind = struct.unpack(order + "HH", data[at + i * step : at + i * step + 4])
+        if tag in found and kind in TIFF_KINDS:
+            code, size = TIFF_KINDS[kind]
+            place = at + i * step + value
+            found[tag] = max(found[tag], struct.unpack(order + code, data[place : place + size])[0])
+    return (found[256], found[257]) if all(found.values()) else None
+
+
+READERS = (
+    (b"\x89PNG\r\n\x1a\n", _png), (b"\xff\xd8\xff", _jpeg), (b"BM", _bmp), (b"RIFF", _webp), (b"II", _tiff), (b"MM", _tiff),
+    *((kind, _portable) for kind in (b"P2", b"P3", b"P5", b"P6")),
+)  # fmt: skip
