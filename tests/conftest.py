@@ -1,7 +1,9 @@
 """What several tests need: the recordings kept beside the repository, and a real Blender with the extension enabled from source."""
 
+import hashlib
 import importlib.util
 import os
+import random
 import shutil
 import sys
 import tempfile
@@ -19,6 +21,19 @@ PLATFORM = {"linux": "linux-x64", "win32": "windows-x64", "darwin": "macos-arm64
 PROFILE = Path(tempfile.mkdtemp(prefix="tricap-profile-"))
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in the command and the add-on: with more threads the last digits differ
 os.environ["BLENDER_USER_RESOURCES"] = str(PROFILE)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="the files, and the tests in each of them, in a random order")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The order of `--shuffle`. Tests of a file stay together: they share what is costly to make."""
+    seed = config.getoption("--shuffle")
+    if seed is not None:
+        places = {item.path: hashlib.sha256(f"{seed} {item.path.name}".encode()).digest() for item in items}
+        random.Random(seed).shuffle(items)
+        items.sort(key=lambda item: places[item.path])
 
 
 _exit_code: list[int] = []

@@ -226,6 +226,14 @@ def test_it_installs_as_the_package_tricap(tmp_path: Path) -> None:
     assert asked.returncode == 0 and "usage: tricap" in asked.stdout, asked.stderr
 
 
+def test_tests_wait_for_events_and_not_for_times() -> None:
+    """A time is too short on a busy machine: `waiting.py` has what waits for something to happen."""
+    waits = re.compile(r"\b(sleep|Timer)\(")
+    sources = [path for path in (ROOT / "tests").rglob("*.py") if not {"bench", "gui"} & {*path.parts}]
+    found = {path.name for path in sources if waits.search(re.sub(r'"[^"\n]*"', "", path.read_text(encoding="utf-8")))}
+    assert found == {"waiting.py"}
+
+
 def test_every_promise_of_the_security_page_names_tests_that_exist() -> None:
     rows = [line for line in (ROOT / "docs" / "security.md").read_text(encoding="utf-8").splitlines() if line.startswith("| **")]
     assert len(rows) > 10

@@ -1,11 +1,13 @@
 """Work shared between threads: pieces that cover everything, results in their order, whatever the number of threads."""
 
-import time
+import threading
 
 import pytest
 
 from tricap.core.foundation import threads
 from tricap.core.foundation.threads import equal_pieces, in_threads
+
+from ...waiting import PATIENCE_S
 
 
 @pytest.mark.parametrize("n", [0, 1, 511, 512, 513, 1650, 5000])
@@ -22,10 +24,15 @@ def test_pieces_are_equal_and_cover_all(n: int) -> None:
 def test_results_keep_their_order(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "THREADS", count)
 
-    def slow_at_first(i: int) -> int:
-        time.sleep(0.02 / (1 + i))
+    last, first = threading.Event(), count == 1
+
+    def last_ends_first(i: int) -> int:
+        """The first waits for the last of those that run at the same time."""
+        if i == count - 1:
+            last.set()
+        assert i or first or last.wait(PATIENCE_S)
         return i * i
 
-    assert in_threads(slow_at_first, range(6)) == [0, 1, 4, 9, 16, 25]
+    assert in_threads(last_ends_first, range(6)) == [0, 1, 4, 9, 16, 25]
     with pytest.raises(ZeroDivisionError):
         in_threads(lambda i: 1 // i, [1, 0])

@@ -7,8 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -23,6 +21,8 @@ from tricap.core.run import batch, pipeline, take_run
 from tricap.core.run import engine as engines
 from tricap.core.run.batch import Outcome, Status, out_folders, run_batch, run_take, summary
 from tricap.core.run.engine import Engine, dask_client
+
+from ...waiting import when
 
 COARSE = {"growing": {"spacing_px": 8}}
 Capture = pytest.CaptureFixture[str]
@@ -59,13 +59,10 @@ def test_a_worker_killed_in_mid_take(takes: list[Path], tmp_path: Path, killing:
     out, killed = tmp_path / "out", list[int]()
 
     def kill() -> None:
-        while not (out / takes[0].name / "cache" / "surface" / "0001.npz").exists():
-            time.sleep(0.01)
         killed.append(json.loads((out / takes[0].name / NAME).read_text())["pid"])
         os.kill(killed[0], signal.SIGKILL)
 
-    killer = threading.Thread(target=kill, daemon=True)
-    killer.start()
+    when((out / takes[0].name / "cache" / "surface" / "0001.npz").exists, kill)
     code = main.main(["batch", *map(str, takes), "--out", str(out), "--workers", "2", "--set", "growing.spacing_px=8"])
     assert killed and killed[0] != os.getpid() and code == 2
     printed = capfd.readouterr()
