@@ -204,7 +204,7 @@ class JobOperator:
         job.run()
         return self._conclude(context, job)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event | None) -> set[str]:
         """Modal driver: start the thread and watch it."""
         session = get_session()
         if session.job is not None and session.job_operator is not None and session.job_operator.gives_way:

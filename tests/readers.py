@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from pose_graphs import pose_graph
 from scene_files import model, record, write_fbx, write_gltf, zeros
 
 from tricap.core.body.model_file import read_model
@@ -34,6 +35,7 @@ from tricap.core.motion.formats.ply import read_ply, write_cloud, write_mesh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.residual_motion import ResidualChain, ResidualMotion, from_text, to_text
 from tricap.core.motion.retarget.roles import read_humanoid
+from tricap.core.networks.onnx_file import input_shape, read_onnx
 from tricap.core.results.folder import Results
 from tricap.core.run import record as frame_table
 from tricap.core.run.inspection import patch_boxes, read_removed, read_tracks
@@ -340,6 +342,8 @@ READERS: dict[str, tuple[Make, Read]] = {
     "rig.toml": (written("rig.toml", lambda p: write_rig(p, RIG)), lambda f: read_rig(f / "rig.toml")),
     **{f"calibration {kind}": calibration(kind) for kind in sorted(FORMATS)},
     "ply": (cloud, lambda f: [read_ply(f / "a.ply"), read_ply(f / "b.ply")]),
+    "network": (written("a.onnx", lambda p: p.write_bytes(pose_graph("simcc", 17, (32, 32)))),
+                lambda f: input_shape(read_onnx(f / "a.onnx"), f)),
     "skin": (skin_of_rest, lambda f: read_skin(f / REST, default_shape(read_model("arm.R")))),
     "npz": (written("a.npz", arrays), lambda f: store.load(f / "a.npz")),
     "checkpoint": (lambda f: (checkpoint(f), [f / "cache" / "surface" / "0000.npz"])[1],

@@ -15,8 +15,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 # Lowest first: a module of core imports only from its own folder and from those to its left.
 LAYERS = (
-    "foundation geometry images matching body motion take results surface calibration synthetic tracking fitting checking synchronising "
-    "report run cli"
+    "foundation geometry images matching body motion networks take results surface calibration synthetic tracking fitting checking "
+    "synchronising report run cli"
 ).split()
 THIRD_PARTY = {"numpy", "scipy", "cv2", "threadpoolctl"}
 OPTIONAL = {

@@ -4,9 +4,10 @@ import bpy
 
 
 def _classes() -> tuple[type, ...]:
-    from . import cameras, check, export, footage, panel, person, synchronise
+    from . import cameras, check, export, footage, network, panel, person, synchronise
 
-    return (*footage.CLASSES, *person.CLASSES, *cameras.CLASSES, *check.CLASSES, *synchronise.CLASSES, *export.CLASSES, *panel.CLASSES)
+    modules = (footage, person, cameras, check, synchronise, network, export, panel)
+    return tuple(cls for module in modules for cls in module.CLASSES)
 
 
 def register() -> None:

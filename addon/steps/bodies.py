@@ -145,6 +145,7 @@ def _clicks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     buttons = layout.column()
     buttons.enabled = project.bound(context.scene)
     primary(buttons, "tricap.click_joints", is_next, icon="WINDOW", text="Open Views and Click")
+    buttons.operator("tricap.find_joints_with_network", icon="OUTLINER_DATA_MESH", text="Find Joints with a Network…")
     try:
         clicked = clicked_views(context)
     except InputError:

@@ -1,4 +1,4 @@
-"""`tricap joints TAKE [--write]`: the person's joints in one frame, found without clicks."""
+"""`tricap joints TAKE [--write]`: the person's joints in one frame, found without clicks; with `--model`, in every image, by a network."""
 
 import argparse
 import json
@@ -6,6 +6,9 @@ import json
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..run.joints import joints_of_take, pixels_of, write_joints_as_clicks
+from ..run.network_joints import joints_by_network, open_network, write_network_joints
+from ..take.footage import open_take
+from ..take.take import read_take
 from .arguments import overrides
 
 
@@ -15,6 +18,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Raises:
         InputError: nobody is found; or, with --write, a click is needed to be certain.
     """
+    if args.model is not None:
+        return _by_network(args, monitor)
     footage, start, settings = joints_of_take(args.take, overrides(args.set), monitor)
     joints, limit = pixels_of(footage, start), settings["fitting"].least_start_probability
     certain = start.probability >= limit
@@ -29,3 +34,23 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     lines += [f"{name:<12}" + "  ".join(f"{view} ({x:.1f}, {y:.1f})" for view, (x, y) in at.items()) for name, at in joints.items()]
     lines += [] if certain else [start.question]
     return [*lines, *([f"{footage.take.folder / 'take.toml'} has them as clicks."] if written else [])]
+
+
+def _by_network(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """The joints in every image, by a network; written as [[keypoints]] where that is asked for."""
+    take = read_take(args.take)
+    found = joints_by_network(open_take(take), open_network(args.model, monitor), monitor)
+    written = write_network_joints(take.folder, found) if args.write else []
+    images = found.numbers.shape[1]
+    counts = {view: {"points": int(n), "contradicted": int(c)} for view, n, c in zip(found.views, found.found, found.contradicted)}
+    if args.json:
+        return [json.dumps({"images": images, "names": found.names, "views": counts}, indent=1)]
+    lines = [
+        f"{view}: {count['points']} of {images * len(found.names)} points in {images} images; "
+        f"{count['contradicted']} others were given up, for their rays miss those of other views."
+        for view, count in counts.items()
+    ]
+    return [
+        *lines,
+        *([f"{take.folder / 'take.toml'} has them as [[keypoints]] ({', '.join(p.name for p in written)})."] if written else []),
+    ]

@@ -114,7 +114,9 @@ def _stages(commands: Any) -> None:
 def _joints(commands: Any) -> None:
     joints = _command(commands, "joints", "find the person's joints in one frame, without clicks", action("joints"))
     _take_argument(joints)
-    joints.add_argument("--write", action="store_true", help="write them into take.toml as clicks, where they are certain")
+    joints.add_argument("--model", type=Path, metavar="FILE.onnx", help="find them in every image with a pose network of your own")
+    about = "write them into take.toml: as clicks, where they are certain; those of a network as [[keypoints]]"
+    joints.add_argument("--write", action="store_true", help=about)
     joints.add_argument("--json", action="store_true", help="print them as JSON")
     _set_argument(joints)
 

@@ -1,0 +1,87 @@
+"""Pose networks of the user's own: every layout sees dots that were drawn; what is no such network is refused with the reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.networks.pose_network import PoseNetwork
+
+from ...pose_graphs import SEEN, drawn, pose_graph, tiny_graph
+
+PICTURE, BOX = (520, 400), (196.0, 80.0, 326.0, 298.0)
+
+
+def opened(folder: Path, data: bytes) -> PoseNetwork:
+    return PoseNetwork.of(data, folder / "pose.onnx")
+
+
+def places(count: int, seed: int = 3) -> np.ndarray:
+    """Places in the box, no two of them near each other."""
+    nodes = np.stack(np.meshgrid(np.linspace(205, 317, 5), np.linspace(90, 288, 6)), axis=-1).reshape(-1, 2)
+    random = np.random.default_rng(seed)
+    return random.permutation(nodes)[:count] + random.uniform(-3, 3, (count, 2))
+
+
+@pytest.mark.parametrize("count", [17, 26])
+@pytest.mark.parametrize(
+    ("layout", "size", "within"),
+    [("heat maps", (192, 256), 0.6), ("heat maps", (256, 192), 1.0), ("simcc", (192, 256), 0.9), ("simcc", (256, 256), 0.9)],
+)
+def test_dots_are_found_where_they_were_drawn(tmp_path: Path, layout: str, size: tuple[int, int], within: float, count: int) -> None:
+    network = opened(tmp_path, pose_graph(layout, count, size, batch="batch"))
+    xy = places(min(count, SEEN))
+    xy[4] = np.nan  # is not in the picture
+    found = network.joints(drawn(PICTURE, xy, radius_px=5.0), BOX)
+    seen = np.flatnonzero(np.isfinite(xy[:, 0]))
+    assert len(network.names) == count and network.names[5] == "left_shoulder"
+    assert np.abs(found[seen, :2] - xy[seen]).max() < within
+    assert found[seen, 2].min() > 0.2 > 0.1 > found[4, 2]
+
+
+def test_the_landmarks_of_mediapipe_are_read(tmp_path: Path) -> None:
+    network = opened(tmp_path, pose_graph("mediapipe", 39, (256, 256)))
+    xy = places(SEEN)
+    found = network.joints(drawn(PICTURE, xy, radius_px=5.0), BOX)
+    assert len(network.names) == 33 and network.names[23] == "left_hip"
+    assert np.abs(found[:SEEN, :2] - xy).max() < 1.0
+    assert found[:SEEN, 2] == pytest.approx(0.9 / (1 + np.exp(-6)) ** 2, abs=1e-3)
+
+
+def test_the_body_of_a_whole_body_layout_is_used(tmp_path: Path) -> None:
+    network = opened(tmp_path, pose_graph("simcc", 133, (192, 256)))
+    assert len(network.names) == 17 and network.joints(drawn(PICTURE, places(17)), BOX).shape == (17, 3)
+
+
+def test_a_box_at_the_edge_and_an_empty_one_are_no_problem(tmp_path: Path) -> None:
+    network = opened(tmp_path, pose_graph("simcc", 17, (288, 384)))
+    xy = places(17)
+    picture = drawn(PICTURE, xy, radius_px=5)
+    for box in ((150.0, -80.0, 340.0, 330.0), (0.0, 0.0, *map(float, PICTURE))):
+        found = network.joints(picture, box)
+        assert np.abs(found[:, :2] - xy).max() < 2.0, box
+    assert network.joints(picture, (9.0, 9.0, 9.0, 9.0))[:, 2].max() < 0.1
+
+
+REFUSED = {
+    "empty": (lambda whole: b"", "no ONNX file, or it is damaged: it has no graph"),
+    "text": (lambda whole: b"a pose network", "no ONNX file, or it is damaged"),
+    "half of it": (lambda whole: whole[: len(whole) // 2], "no ONNX file, or it is damaged: a field goes beyond its end"),
+    "two inputs": (lambda whole: tiny_graph((1, 3, 64, 64), inputs=2), "a network with 2 inputs"),
+    "any size": (lambda whole: tiny_graph((1, 3, "h", "w")), "takes 1 × 3 × any × any; give a network that takes one colour image"),
+    "many images": (lambda whole: tiny_graph((8, 3, 64, 64)), "takes 8 × 3 × 64 × 64"),
+    "grey": (lambda whole: tiny_graph((1, 1, 64, 64)), "takes 1 × 1 × 64 × 64"),
+    "huge": (lambda whole: tiny_graph((1, 3, 40000, 64)), "takes 1 × 3 × 40000 × 64"),
+    "a list": (lambda whole: tiny_graph((7,)), "takes 7;"),
+    "other outputs": (lambda whole: tiny_graph((1, 3, 64, 64)), "returns 1 × 3 × 64 × 64; known are heat maps"),
+    "unknown operation": (lambda whole: whole.replace(b"Relu", b"Rolu"), "OpenCV cannot read the network"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_pose_network_is_refused(tmp_path: Path, case: str) -> None:
+    made, said = REFUSED[case]
+    with pytest.raises(InputError) as error:
+        opened(tmp_path, made(pose_graph("heat maps", 17, (64, 64))))
+    assert said in str(error.value) and "pose.onnx" in str(error.value)
