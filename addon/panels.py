@@ -4,7 +4,7 @@ import textwrap
 
 import bpy
 
-from ..core.foundation.errors import InputError
+from ..core.foundation.errors import sentence_of
 from .session import get_session
 
 CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
@@ -25,8 +25,11 @@ class TellingOperator:
         """Do it."""
         try:
             message = self.do(context)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        except Exception as error:  # the edge of the operator: faults of the input and of the system are told, bugs are raised
+            reason = sentence_of(error)
+            if reason is None:
+                raise
+            self.report({"ERROR"}, reason)  # type: ignore[attr-defined]
             return {"CANCELLED"}
         if message:
             self.report({"INFO"}, message)  # type: ignore[attr-defined]

@@ -28,6 +28,7 @@ from ...core.geometry.rig import write_rig
 from ...core.take.bar_file import write_bar
 from .. import folders, project
 from ..jobs import JobOperator
+from ..panels import TellingOperator
 from ..session import get_session
 from ..steps.cameras import use_rig
 from .cameras import build_cameras, rig_of_scene
@@ -193,7 +194,7 @@ def compute_wand(footage: BarFootage, measured: MeasuredBar, result: CalibratedR
     )
 
 
-class PrintBoard(ExportHelper, bpy.types.Operator):
+class PrintBoard(TellingOperator, ExportHelper, bpy.types.Operator):
     """Save the board for a printer, in its true size, as PDF or PNG. Print it without scaling, and glue it to a flat plate"""
 
     bl_idname = "tricap.print_board"
@@ -202,41 +203,31 @@ class PrintBoard(ExportHelper, bpy.types.Operator):
     filename_ext = ".pdf"
     check_extension = None
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Write the file."""
         props = context.scene.tricap_calibrate
-        try:
-            if props.target == "WAND":
-                raise InputError("Choose ChArUco or Checkerboard first; a wand is not printed.")
-            board, path = board_of(props), folders.absolute(self.filepath)
-            write_board(path, board)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"A {board.kind.value} of {board.label} in {path}. Print it without scaling.")
-        return {"FINISHED"}
+        if props.target == "WAND":
+            raise InputError("Choose ChArUco or Checkerboard first; a wand is not printed.")
+        board, path = board_of(props), folders.absolute(self.filepath)
+        write_board(path, board)
+        return f"A {board.kind.value} of {board.label} in {path}. Print it without scaling."
 
 
-class ImportRig(ImportHelper, bpy.types.Operator):
+class ImportRig(TellingOperator, ImportHelper, bpy.types.Operator):
     """Add cameras from a calibration file: Tricap, Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV or Agisoft"""
 
     bl_idname = "tricap.import_rig"
     bl_label = "Import Cameras"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Read the file and build its cameras."""
-        try:
-            rig = read_any(folders.absolute(self.filepath))
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        rig = read_any(folders.absolute(self.filepath))
         build_cameras(context.scene, rig, {}, {})
-        self.report({"INFO"}, f"{len(rig.cameras)} cameras from {self.filepath}.")
-        return {"FINISHED"}
+        return f"{len(rig.cameras)} cameras from {self.filepath}."
 
 
-class ExportRig(ExportHelper, bpy.types.Operator):
+class ExportRig(TellingOperator, ExportHelper, bpy.types.Operator):
     """Export the scene's cameras, with the lens distortion of their background clips, as a calibration file"""
 
     bl_idname = "tricap.export_rig"
@@ -250,19 +241,14 @@ class ExportRig(ExportHelper, bpy.types.Operator):
         items=[(name, name, "") for name in ("tricap", *sorted(FORMATS))],
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Read the scene and write the file."""
-        try:
-            rig, path = rig_of_scene(context.scene), folders.absolute(self.filepath)
-            if self.layout_name == "tricap":
-                write_rig(path, rig)
-            else:
-                write_as(path, rig, self.layout_name)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"{len(rig.cameras)} cameras in {path}.")
-        return {"FINISHED"}
+        rig, path = rig_of_scene(context.scene), folders.absolute(self.filepath)
+        if self.layout_name == "tricap":
+            write_rig(path, rig)
+        else:
+            write_as(path, rig, self.layout_name)
+        return f"{len(rig.cameras)} cameras in {path}."
 
 
 CLASSES = (Calibrate, PrintBoard, ImportRig, ExportRig)

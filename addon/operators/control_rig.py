@@ -3,6 +3,7 @@
 import bpy
 
 from ...core.foundation.errors import InputError
+from ..panels import TellingOperator
 from ..retarget import control_rig
 from ..scene import standing
 
@@ -21,27 +22,22 @@ def body_of(context: bpy.types.Context, *, standing_only: bool = True) -> bpy.ty
     return next((body for body in bodies if body.select_get()), bodies[0])
 
 
-class MakeControlRig(bpy.types.Operator):
+class MakeControlRig(TellingOperator, bpy.types.Operator):
     """Make controls with IK and FK by Rigify. The measured motion is their base layer, with an empty layer for corrections over it"""
 
     bl_idname = "tricap.make_control_rig"
     bl_label = "Make Control Rig"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Make it."""
-        try:
-            if context.mode != "OBJECT":
-                bpy.ops.object.mode_set(mode="OBJECT")
-            made = control_rig.make_control_rig(body_of(context))
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"“{made.rig.name}” plays the motion within {made.angle_deg:.3f}° and {made.place_mm:.2f} mm.")
-        return {"FINISHED"}
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        made = control_rig.make_control_rig(body_of(context))
+        return f"“{made.rig.name}” plays the motion within {made.angle_deg:.3f}° and {made.place_mm:.2f} mm."
 
 
-class SnapLimbs(bpy.types.Operator):
+class SnapLimbs(TellingOperator, bpy.types.Operator):
     """Switch arms and legs between IK and FK in this frame, without moving the body. Auto Keying keys the controls"""
 
     bl_idname = "tricap.snap_limbs"
@@ -51,16 +47,11 @@ class SnapLimbs(bpy.types.Operator):
     to: bpy.props.EnumProperty(name="To", items=[("IK", "IK", "Pose limbs by hand and foot"), ("FK", "FK", "Pose limbs by rotations")])  # type: ignore[valid-type]
     limbs: bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")  # type: ignore[valid-type]
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Snap them."""
         limbs = [limb.strip() for limb in self.limbs.split(",") if limb.strip()]
-        try:
-            count = control_rig.snap(body_of(context), self.to, limbs)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} now.")
-        return {"FINISHED"}
+        count = control_rig.snap(body_of(context), self.to, limbs)
+        return f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} now."
 
 
 def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:

@@ -9,12 +9,13 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.settings import nearest_name
 from ...core.tracking.point_tables import PlanarTable, read_planar, read_points
 from .. import folders
+from ..panels import TellingOperator
 from ..scene.planar import add_planar
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-class ImportTracks2d(bpy.types.Operator):
+class ImportTracks2d(TellingOperator, bpy.types.Operator):
     """Import points that `tricap track2d` tracked in one camera: an empty for each over the footage, and curves between joined points"""
 
     bl_idname = "tricap.import_tracks2d"
@@ -39,18 +40,13 @@ class ImportTracks2d(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Read the files, then build."""
-        try:
-            table = read_planar(folders.absolute(self.filepath))
-            joined = read_joints(folders.absolute(self.points), table) if self.points else ()
-            footage = open_footage(folders.absolute(self.footage)) if self.footage else None
-            made = add_planar(context.scene, table, joined, footage)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"{made.name}: {len(table.names)} points over {len(table.frames)} frames, {len(joined)} curves")
-        return {"FINISHED"}
+        table = read_planar(folders.absolute(self.filepath))
+        joined = read_joints(folders.absolute(self.points), table) if self.points else ()
+        footage = open_footage(folders.absolute(self.footage)) if self.footage else None
+        made = add_planar(context.scene, table, joined, footage)
+        return f"{made.name}: {len(table.names)} points over {len(table.frames)} frames, {len(joined)} curves"
 
 
 def read_joints(path: Path, table: PlanarTable) -> tuple[tuple[str, str], ...]:

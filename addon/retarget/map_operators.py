@@ -8,39 +8,40 @@ import bpy
 from ...core.foundation.errors import InputError
 from ...core.motion.retarget.mapping import write_map
 from ...core.motion.retarget.roles import ROLES
+from ..panels import TellingOperator
 from . import apply, properties
 from .operators import armature_of
 from .read import read_rig
 
 
-def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Path | None) -> set[str]:
-    """Fill the editor with the target's mapping, recognised or from a file."""
+def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Path | None) -> str:
+    """Fill the editor with the target's mapping, recognised or from a file.
+
+    Raises:
+        InputError: there is no target, or the file is no mapping for it.
+    """
     props = context.scene.tricap_retarget
-    try:
-        target = armature_of("", props.target, "target")
-        rig_map = apply.map_of(read_rig(target), file, controls=True)
-    except InputError as error:
-        operator.report({"ERROR"}, str(error))
-        return {"CANCELLED"}
+    target = armature_of("", props.target, "target")
+    rig_map = apply.map_of(read_rig(target), file, controls=True)
     properties.fill_rows(props, rig_map, target)
     for line in (*rig_map.missing_notes, *rig_map.notes):
         operator.report({"INFO"}, line)
-    return {"FINISHED"}
+    return ""
 
 
-class FindMap(bpy.types.Operator):
+class FindMap(TellingOperator, bpy.types.Operator):
     """Recognise the target's bones by their names and the shape of the rig, and show the mapping for editing"""
 
     bl_idname = "tricap.retarget_find_map"
     bl_label = "Recognise"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Fill the editor."""
         return show_map(self, context, None)
 
 
-class LoadMap(bpy.types.Operator):
+class LoadMap(TellingOperator, bpy.types.Operator):
     """Load the target's mapping from a file, and show it for editing"""
 
     bl_idname = "tricap.retarget_load_map"
@@ -55,12 +56,12 @@ class LoadMap(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Fill the editor."""
         return show_map(self, context, Path(bpy.path.abspath(self.filepath)))
 
 
-class SaveMap(bpy.types.Operator):
+class SaveMap(TellingOperator, bpy.types.Operator):
     """Save the mapping to a file, to edit, share or reuse it"""
 
     bl_idname = "tricap.retarget_save_map"
@@ -74,18 +75,14 @@ class SaveMap(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Write it."""
         props = context.scene.tricap_retarget
-        try:
-            rig_map = properties.edited_map(props, props.rows_of)
-            if rig_map is None:
-                raise InputError("There is no mapping to save; press Recognise first.")
-            write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        rig_map = properties.edited_map(props, props.rows_of)
+        if rig_map is None:
+            raise InputError("There is no mapping to save; press Recognise first.")
+        write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
+        return ""
 
 
 class AddLine(bpy.types.Operator):

@@ -15,6 +15,7 @@ from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, begun
 from ...core.motion.retarget.rig import Motion, resampled
 from ...core.motion.sources import read_motion_source
 from ..jobs import JobOperator
+from ..panels import TellingOperator
 from ..properties import snapshot
 from . import apply, preview, properties
 from .read import action_frames, read_motion, read_rig, with_residual_motion
@@ -112,26 +113,21 @@ def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, neede
     return found
 
 
-class Preview(bpy.types.Operator):
+class Preview(TellingOperator, bpy.types.Operator):
     """Let the target follow the source live, by constraints; only Retarget plants the feet"""
 
     bl_idname = "tricap.retarget_preview"
     bl_label = "Preview"
     bl_options = {"UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def do(self, context: bpy.types.Context) -> str:
         """Add the constraints."""
         props = context.scene.tricap_retarget
-        try:
-            source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
-            apply.check_distinct(source, target)
-            rig, mapped = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
-            count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, mapped.mapped)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"{count} bones of {target.name} follow {source.name}.")
-        return {"FINISHED"}
+        source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
+        apply.check_distinct(source, target)
+        rig, mapped = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
+        count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, mapped.mapped)
+        return f"{count} bones of {target.name} follow {source.name}."
 
 
 class EndPreview(bpy.types.Operator):
