@@ -28,8 +28,7 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
         TypeError: Blender has no property for its type.
     """
     meta, default = field.metadata, field.default
-    unit = f" [{meta['unit']}]" if meta.get("unit") else ""
-    words: dict[str, Any] = dict(name=title(field.name, meta.get("unit", "")) + unit, description=meta.get("about", "").rstrip("."))
+    words: dict[str, Any] = dict(name=label(field), description=meta.get("about", "").rstrip("."))
     words["update"] = take_properties.notify_change
     if isinstance(default, bool):
         return bpy.props.BoolProperty(default=default, **words)
@@ -43,6 +42,12 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
     if isinstance(default, float):
         return bpy.props.FloatProperty(default=default, precision=4, **limits, **words)
     raise TypeError(f"Setting {field.name} is a {type(default).__name__}, for which there is no property")
+
+
+def label(field: "dataclasses.Field[Any]") -> str:
+    """A setting's name in the panel, with its unit: Patch [px]."""
+    unit = field.metadata.get("unit", "")
+    return title(field.name, unit) + (f" [{unit}]" if unit else "")
 
 
 def title(name: str, unit: str) -> str:

@@ -108,6 +108,11 @@ def points() -> Markers:
     return Markers(names=("elbow.R", "wrist.R"), fps=50.0, frames=np.arange(12), xyz_m=xyz, sigma_m=np.full((12, 2), 1e-3))
 
 
+def segments() -> c3d.Segments:
+    R = np.broadcast_to(np.eye(3), (12, 2, 3, 3))
+    return c3d.Segments(names=("forearm.R", "hand.R"), frames=np.arange(12), R=R, origin_m=points().xyz_m)
+
+
 def residual_motion() -> str:
     one = np.full((1, 2, 3), 0.25)
     chain = ResidualChain(role="neck", order=(-1,), ends=np.ones(1), along_m=np.ones(3), parent="spine", size=1, turn=one)
@@ -357,6 +362,7 @@ READERS: dict[str, tuple[Make, Read]] = {
     "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
     "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
     "c3d": (written("a.c3d", lambda p: c3d.write_c3d(p, points())), lambda f: c3d.read_c3d(f / "a.c3d")),
+    "c3d segments": (written("a.c3d", lambda p: c3d.write_c3d(p, points(), segments=segments())), lambda f: c3d.read_segments(f / "a.c3d")),
     "csv of points": (written("a.csv", lambda p: markers.write_points_csv(p, points())),
                       lambda f: markers.read_points_csv(f / "a.csv")),
     "bvh": (written("a.bvh", bvh_file), lambda f: bvh.read_bvh(f / "a.bvh")),

@@ -23,6 +23,7 @@ from ..scene.rest_pose import POSES
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 DEFAULT_LIGHT_M = (4.07625, 1.00545, 5.90386)  # where the light of Blender's startup file is
+DEFAULT_CAMERA_M = (7.35889, -6.92579, 4.95831)  # and its camera
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
@@ -164,14 +165,15 @@ def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.t
 
 
 def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
-    """Hide the cube of Blender's startup file, in which the body would stand up to the chest, and its light, if they are unchanged."""
-    wanted = {"Cube": _is_default_cube, "Light": _is_default_light}
+    """Hide the cube of Blender's startup file, in which the body would stand up to the chest, its light and its camera, if unchanged."""
+    wanted = {"Cube": _is_default_cube, "Light": _is_default_light, "Camera": _is_default_camera}
     hidden = [thing for name, unchanged in wanted.items() if (thing := context.scene.objects.get(name)) is not None and unchanged(thing)]
     for thing in hidden:
         thing.hide_set(True)
         thing.hide_render = True
     if hidden:
-        names, were = " and ".join(thing.name.lower() for thing in hidden), "were" if len(hidden) > 1 else "was"
+        lower = [thing.name.lower() for thing in hidden]
+        names, were = " and ".join(filter(None, [", ".join(lower[:-1]), lower[-1]])), "were" if len(hidden) > 1 else "was"
         operator.report({"INFO"}, f"Blender's default {names} {were} hidden to show the body alone.")
 
 
@@ -184,6 +186,12 @@ def _is_default_cube(cube: bpy.types.Object) -> bool:
 def _is_default_light(light: bpy.types.Object) -> bool:
     there = (light.location - Vector(DEFAULT_LIGHT_M)).length < 1e-3
     return light.type == "LIGHT" and light.data.type == "POINT" and there and not light.animation_data and not light.hide_get()
+
+
+def _is_default_camera(camera: bpy.types.Object) -> bool:
+    there = (camera.location - Vector(DEFAULT_CAMERA_M)).length < 1e-3
+    used = camera == bpy.context.scene.camera  # where the footage has no cameras yet
+    return camera.type == "CAMERA" and there and not used and not camera.animation_data and not camera.hide_get()
 
 
 def report_scene(operator: bpy.types.Operator, report: SceneReport) -> None:

@@ -24,7 +24,7 @@ from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
 from ..scene import skin
-from . import playing
+from . import playing, programs
 from .build import build_armature
 from .programs import Program, bone_names
 
@@ -42,6 +42,7 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     """
     if kind == "abc" and not out.is_dir():
         raise InputError(NO_MESHES)
+    motion = programs.rooted(motion, program)
     with _plain_armature(kind, file, program, motion) as armature_object:
         if out.is_dir():
             shape, of_run = skin.skin_of_run(out)
@@ -61,6 +62,7 @@ def export_played(kind: str, file: Path, program: Program, armature_object: bpy.
     skins = playing.skins_of(armature_object)
     if kind == "abc" and not skins:
         raise InputError(NO_MESHES)
+    motion = programs.rooted(motion, program)
     with playing.in_first_frame(), _plain_armature(kind, file, program, motion) as plain:
         with playing.copied_skins(skins, armature_object, plain, 1.0 / _unit_m(kind, program)):
             _write(kind, file, program, plain, bone_names(motion.rig, program))

@@ -17,7 +17,7 @@ from ...core.results.folder import check_not_result
 PROGRAM_NAMES = ("plain", "mixamo", "unreal", "unity", "maya", "motionbuilder", "opensim")
 UNITS = ("m", "meters", "metres", "dm", "cm", "mm", "um", "in", "inch")
 PLY_FOLDERS = ("skin", "clouds", "tracked")  # of OUT
-FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
+FORMATS = ("bvh", "mot", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
 
 def add_commands(subparsers: Any) -> None:

@@ -10,8 +10,9 @@ from ...core.foundation import bounded, store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.bvh import write_bvh
-from ...core.motion.formats.c3d import write_c3d
+from ...core.motion.formats.c3d import Segments, write_c3d
 from ...core.motion.formats.markers import Markers, metres_per, rate, write_points_csv
+from ...core.motion.formats.opensim import write_opensim
 from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
@@ -20,9 +21,10 @@ from ...core.results.folder import check_not_result
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
+MODEL_ENDING = ".osim"  # of the model that a .mot file moves, next to it
 POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # usual axes and unit of the format
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
-ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
+ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "mot", "fbx", "abc", *POINTS)} | {
     "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
 
 
@@ -39,6 +41,8 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
     if out is not None:
         check_not_result(file, out)
+        if kind == "mot":
+            check_not_result(file.with_suffix(MODEL_ENDING), out)
     return file
 
 
@@ -60,10 +64,11 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     if kind == "ply":
         return _copy_ply(out, file, of)
     if kind in POINTS:
-        return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
+        moving = read_motion_source(out, up=up, unit=unit) if kind == "c3d" and _has_segments(out) else None
+        return _write_points(kind, file, points_of(out, up=up, unit=unit), program, moving)
     motion = read_motion_source(out, up=up, unit=unit)
-    if kind == "bvh":
-        return _write_bvh(file, motion, program)
+    if kind in SKELETONS:
+        return SKELETONS[kind](file, motion, program)
     from .by_blender import export_motion
 
     return export_motion(kind, out, file, program, motion)
@@ -83,9 +88,9 @@ def export_played(armature_object: Any, kind: str, file: Path, preset: str, moni
         return playing.write_skins(armature_object, file, monitor)
     motion = playing.read_played(armature_object, monitor)
     if kind in POINTS:
-        return _write_points(kind, file, playing.points_of_played(armature_object, motion), program)
-    if kind == "bvh":
-        return _write_bvh(file, motion, program)
+        return _write_points(kind, file, playing.points_of_played(armature_object, motion), program, motion)
+    if kind in SKELETONS:
+        return SKELETONS[kind](file, motion, program)
     return by_blender.export_played(kind, file, program, armature_object, motion)
 
 
@@ -93,6 +98,19 @@ def _write_bvh(file: Path, motion: Motion, program: Program) -> str:
     names, unit_m = bone_names(motion.rig, program), metres_per(program.unit or "m", "the preset")
     write_bvh(file, motion, unit_m=unit_m, order=program.bvh_order, names=names)
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
+
+
+def _write_opensim(file: Path, motion: Motion, program: Program) -> str:
+    write_opensim(file, motion, names=bone_names(motion.rig, program))
+    return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames, and their model {file.with_suffix(MODEL_ENDING).name}"
+
+
+SKELETONS = {"bvh": _write_bvh, "mot": _write_opensim}
+
+
+def _has_segments(out: Path) -> bool:
+    """Whether a motion has rotations of its own, not those that points suggest."""
+    return (out / "body.toml").is_file() if out.is_dir() else out.suffix.lower() == ".bvh"
 
 
 def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:
@@ -113,10 +131,16 @@ def heads_of(motion: Motion) -> Markers:
     return Markers(names=motion.rig.names, fps=motion.fps, frames=motion.frames, xyz_m=motion.head_m, sigma_m=np.full(shape, np.nan))
 
 
-def _write_points(kind: str, file: Path, markers: Markers, program: Program) -> str:
+def _write_points(kind: str, file: Path, markers: Markers, program: Program, moving: Motion | None = None) -> str:
+    """Write points; into C3D also the poses of the bones that are `moving`."""
     axes, unit = program.axes or POINTS[kind][0], program.unit or POINTS[kind][1]
-    WRITE_POINTS[kind](file, replace(markers, names=joint_names(markers.names, program)), axes=axes, unit=unit)
-    return f"{len(markers.names)} points in {len(markers.frames)} frames"
+    segments = {}
+    if kind == "c3d" and moving is not None:
+        given = bone_names(moving.rig, program)
+        names = tuple(given.get(name, name) for name in moving.rig.names)
+        segments["segments"] = Segments(names=names, frames=moving.frames, R=moving.R, origin_m=moving.head_m)
+    WRITE_POINTS[kind](file, replace(markers, names=joint_names(markers.names, program)), axes=axes, unit=unit, **segments)
+    return f"{len(markers.names)} points in {len(markers.frames)} frames" + (f", {len(names)} segments" if segments else "")
 
 
 def _copy_ply(out: Path, folder: Path, of: str) -> str:

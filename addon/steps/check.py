@@ -1,10 +1,13 @@
 """bpy.ops.tricap.check(), .mend_offsets(), .match_names(), .set_fields()
 
+The findings name buttons and settings of the panel, where the command names files and options (`in_panel`).
 In the window, the check begins by itself when footage and cameras are there and nothing else runs; it gives way to any other job.
 """
 
+import dataclasses
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,9 @@ from ...core.foundation.progress import Monitor
 from ...core.geometry.rig import read_rig, renamed
 from ...core.images.interlace import BOTH
 from ...core.run.check import check_take
+from ...core.run.stages import STAGE_INPUTS
 from ...core.take.bar_file import read_bar
-from .. import project
+from .. import project, properties
 from ..jobs import JobOperator
 from ..session import get_session
 from . import states, watch
@@ -26,6 +30,7 @@ from .cameras import use_rig
 from .footage import SimpleOperator
 
 GOOD = "No problems found."
+OPTION = re.compile(r"--set (\w+)\.(\w+)=([\w.-]*\w)")  # in the advice of a finding
 LOOK_S = 2.0  # between two looks whether a check should begin by itself
 
 
@@ -47,6 +52,33 @@ def mends_of(checked: Checked) -> Mends:
         camera_of=by_cause.get(Cause.SWAPPED_VIEWS, {}).get("camera_of", {}),
         first_field=str(by_cause[Cause.COMBING]["first_field"] or "odd") if Cause.COMBING in by_cause else "",
     )
+
+
+def in_panel(checked: Checked, mends: Mends) -> list[str]:
+    """The findings as lines for the panel: what a button below mends names that button, and a setting its place in the panel."""
+    pressed = {
+        Cause.COMBING: SetFields.bl_label if mends.first_field else "",
+        Cause.SWAPPED_VIEWS: MatchNames.bl_label if mends.camera_of else "",
+        Cause.NOT_SYNCHRONISED: SetOffsets.bl_label if any(mends.late_frames.values()) else "",
+    }
+    lines = []
+    for finding in checked.findings:
+        button = pressed.get(finding.cause, "")
+        if finding.cause == Cause.NOT_SYNCHRONISED and not mends.late_frames.get(finding.figures.get("view", ""), 0):
+            button = ""
+        advice = f"Press {button}, and check again." if button else finding.advice
+        lines.append(str(replace(finding, advice=OPTION.sub(_named_setting, advice))))
+    return lines
+
+
+def _named_setting(option: re.Match[str]) -> str:
+    """An option of the command, `--set matching.patch_px=21`, as the panel shows it: Patch [px] 21 (step 4 Surface)."""
+    group, name, value = option.groups()
+    knob = next(field for field in dataclasses.fields(properties.stages()[group]) if field.name == name)
+    step = next((step for step, stage in states.STAGE.items() if group in STAGE_INPUTS[stage].settings), "")
+    number = states.STEPS.index(step) if step else -1
+    place = f" (step {number + 1} {states.TITLES[number]})" if step else ""
+    return f"{properties.label(knob)} {value}{place}"
 
 
 def found(scene: bpy.types.Scene) -> Mends:
@@ -72,10 +104,11 @@ class Check(JobOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, result: Checked) -> set[str]:
         """Store the findings for the panel."""
         props = context.scene.tricap
-        props.check_said = "\n".join(str(finding) for finding in result.findings) or GOOD
+        mends = mends_of(result)
+        props.check_said = "\n".join(in_panel(result, mends)) or GOOD
         props.check_passed = not result.findings
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
-        get_session().file.mends[props.check_key] = mends_of(result)
+        get_session().file.mends[props.check_key] = mends
         context.window_manager.tricap_steps.cameras = context.window_manager.tricap_steps.cameras or not props.check_passed
         for line in props.check_said.splitlines():
             self.report({"INFO" if props.check_passed else "WARNING"}, line)

@@ -22,7 +22,8 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 KINDS = (
     ("bvh", "BVH", "The motion of the skeleton, for nearly all animation software"),
     ("trc", "TRC", "The joints as points, for OpenSim"),
-    ("c3d", "C3D", "The joints as points, for biomechanics"),
+    ("c3d", "C3D", "The joints as points, and the poses of all segments, for biomechanics"),
+    ("mot", "OpenSim", "A scaled model (.osim) and its coordinates (.mot)"),
     ("csv", "CSV", "The joints as a table with their sigmas"),
     ("fbx", "FBX", "Skeleton and skin, for game engines and animation software"),
     ("glb", "glTF", "Skeleton and skin, for game engines and the web"),

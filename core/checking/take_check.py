@@ -386,7 +386,7 @@ def timing_finding(offset: TimeOffset) -> Finding:
     word = "later" if delay > 0 else "earlier"
     steps = [f"add {-round(delay):+d} to `offset_frames` of view {offset.view} in take.toml"] if round(delay) else []
     if abs(delay - round(delay)) > SMALL:
-        steps.append("set `correct = true` under [settings.timing], which interpolates its images to the moment of the others")
+        steps.append("use --set timing.correct=true, which interpolates its images to the moment of the others")
     advice = " and ".join(steps or ["measure it as it is"]) + "; or synchronize the cameras."
     advice = advice[0].upper() + advice[1:]
     if offset.method == "energy":
@@ -394,6 +394,7 @@ def timing_finding(offset: TimeOffset) -> Finding:
             Cause.NOT_SYNCHRONISED,
             f"View {offset.view} seems to be {abs(delay):.0f} frames {word} than the reference view, judging by the amount of motion only.",
             f"Compare the views at a sudden movement. If that is right: {advice[0].lower()}{advice[1:]}",
+            view=offset.view,
             **offset.to_table(),
         )
     return (wrong if abs(delay) > SPOILS else doubtful)(
@@ -401,6 +402,7 @@ def timing_finding(offset: TimeOffset) -> Finding:
         f"View {offset.view} is {abs(delay):.2f} ± {sigma:.2g} frames {word} than the reference view; "
         f"the rays of moving points miss by up to {offset.effect_px:.1f} px.",
         advice,
+        view=offset.view,
         **offset.to_table(),
     )
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,16 +16,19 @@ import pytest
 
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
-from tricap.addon.retarget.export import export_file, named_for, points_of
+from tricap.addon.retarget.export import export_file, export_played, named_for, points_of
+from tricap.addon.retarget.playing import read_played
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.rotation import about, angle_of, transposed
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
-from tricap.core.motion.formats.c3d import read_c3d
+from tricap.core.motion.formats.c3d import read_c3d, read_segments
 from tricap.core.motion.formats.markers import AXES, read_points_csv
 from tricap.core.motion.formats.trc import read_trc
 from tricap.core.motion.sources import from_run, read_motion_source
 
 from ..core.motion.persons import person, squat
+from ..core.motion.test_studio_files import played_by_opensim
 from .conftest import SmallRun
 
 PLACE_M = 1e-4  # promised: 0.1 mm
@@ -254,3 +258,55 @@ def test_nothing_of_blenders_own_is_written_among_the_answers(small_run: SmallRu
     assert json.loads(said["retarget"])["frames"] == 2 and said["export"] == f"{fbx}: 2 bones in 6 frames\n"
     quiet = subprocess.run([sys.executable, "-m", "tricap", "export", *lines["export"], "--quiet"], capture_output=True, text=True)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+
+
+@pytest.fixture
+def walker(empty: ModuleType) -> Any:
+    """A person that plays a squat while it walks a metre and turns by 90°."""
+    motion = squat(person(arms_down_deg=40.0))
+    turned = about(np.array([0.0, 0.0, 1.0]), np.linspace(0, np.pi / 2, len(motion.frames)))
+    path_m = np.linspace(0, 1, len(motion.frames))[:, None] * (0.0, -1.0, 0.0)
+    head_m = np.einsum("tij,tbj->tbi", turned, motion.head_m) + path_m[:, None]
+    return build_armature(replace(motion, R=turned[:, None] @ motion.R, head_m=head_m), "Walker")
+
+
+@pytest.mark.parametrize(("preset", "root", "hips"), [("unreal", "root", "pelvis"), ("unity", "Root", "Hips")])
+def test_engines_get_a_root_bone_that_carries_the_path(
+    empty: ModuleType, walker: Any, tmp_path: Path, preset: str, root: str, hips: str
+) -> None:
+    wanted = read_played(walker)
+    export_played(walker, "fbx", tmp_path / "a.fbx", preset, Monitor())
+    imported(empty, tmp_path / "a.fbx", wanted.fps)
+    armature = next(o for o in empty.data.objects if o.type == "ARMATURE")
+    assert [b.name for b in armature.data.bones if b.parent is None] == [root] and armature.data.bones[hips].parent.name == root
+    found = {name: [] for name in (root, hips)}
+    first, last = armature.animation_data.action.frame_range
+    for frame in np.linspace(first, last, len(wanted.frames)):
+        empty.context.scene.frame_set(int(frame + 1e-4), subframe=max(float(frame - int(frame + 1e-4)), 0.0))
+        for name, places in found.items():
+            places.append(armature.matrix_world @ armature.pose.bones[name].head)
+    hips_m = wanted.head_m[:, wanted.rig.index["hips"]]
+    assert np.abs(np.array(found[hips]) - hips_m).max() < PLACE_M
+    assert np.abs(np.array(found[root])[:, :2] - hips_m[:, :2]).max() < PLACE_M
+
+
+def test_opensim_and_segments_of_what_plays(empty: ModuleType, walker: Any, tmp_path: Path) -> None:
+    wanted = read_played(walker)
+    done = export_played(walker, "mot", tmp_path / "a.mot", "opensim", Monitor())
+    assert "their model a.osim" in done
+    _, R, origin_m = played_by_opensim(tmp_path / "a.osim", tmp_path / "a.mot")
+    A = AXES["OpenSim"]
+    assert np.abs(origin_m - wanted.head_m @ A.T).max() < PLACE_M
+    assert np.degrees(angle_of(transposed(R) @ A @ wanted.R @ transposed(wanted.rig.R_rest) @ A.T)).max() < 0.1
+    assert "20 segments" in export_played(walker, "c3d", tmp_path / "a.c3d", "plain", Monitor())
+    found = read_segments(tmp_path / "a.c3d")
+    assert found is not None and np.abs(found.origin_m - wanted.head_m).max() < PLACE_M
+    assert np.degrees(angle_of(transposed(found.R) @ wanted.R)).max() < 0.1
+
+
+def test_segments_of_a_run(small_run: SmallRun, tmp_path: Path) -> None:
+    source = from_run(small_run.out)
+    assert "segments" in export_file(small_run.out, "c3d", tmp_path / "a.c3d", "plain", Monitor())
+    found = read_segments(tmp_path / "a.c3d")
+    assert found is not None and found.names == source.rig.names
+    assert np.abs(found.origin_m[np.isin(found.frames, source.frames)] - source.head_m).max() < PLACE_M

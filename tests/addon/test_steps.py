@@ -564,6 +564,22 @@ def test_the_check_is_kept_until_its_input_changes(blender: ModuleType, words: W
     assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in mends
 
 
+def test_the_panel_names_buttons_and_settings_instead_of_files_and_options(blender: ModuleType) -> None:
+    check = importlib.import_module(f"{NAME}.steps.check")
+    findings = importlib.import_module(f"{NAME.removesuffix('.addon')}.core.checking.findings")
+    cause = findings.Cause
+    late = findings.wrong(cause.NOT_SYNCHRONISED, "View R is late.", "Add -1 to `offset_frames` of view R in take.toml.", view="R")
+    weak = findings.doubtful(cause.WEAK_TEXTURE, "Poor.", "Use more light; or try --set matching.patch_px=21.")
+    half = findings.doubtful(cause.NOT_SYNCHRONISED, "View C is late.", "Use --set timing.correct=true, which helps.", view="C")
+    checked = findings.Checked(subject="kick", kind="take", findings=(late, weak, half), figures={})
+    assert check.in_panel(checked, check.Mends(late_frames={"R": 1, "C": 0})) == [
+        "Wrong: View R is late. Press Set Offsets, and check again.",
+        "Doubtful: Poor. Use more light; or try Patch [px] 21 (step 4 Surface).",
+        "Doubtful: View C is late. Use Correct true (step 4 Surface), which helps.",
+    ]
+    assert "offset_frames" in check.in_panel(checked, check.Mends())[0], "without a button the file is named"
+
+
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])
 def test_stopping_at_each_stage_says_what_is_kept_and_goes_on(
     blender: ModuleType, words: Words, why: Callable[[str], str], sample: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch

@@ -1,18 +1,21 @@
 """C3D: points over time with residuals, binary (The C3D File Format User Guide, Motion Lab Systems, 2008).
 
-Only the points are read and written, no analogue channels. The library `c3d` would be one more wheel in the extension, trusts the counts in
-a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
+Points and poses of segments are read and written, no analogue channels. The library `c3d` would be one more wheel in the extension, trusts
+the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
 
 Blocks of 512 bytes: header, parameters (groups and entries with relative pointers), then per frame and point x, y, z and a fourth word:
 negative for a missing point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if unknown.
+Segments, as Theia3D and Visual3D write them (C-Motion, "ROTATION data type"): the group ROTATION names them, and its block DATA_START has
+per frame and segment the 16 numbers of its pose, column by column, and a residual, negative where the pose is unknown.
 Frames are numbered from 1 and without gaps: missing frames are written as missing points, and TRICAP:FRAME_OFFSET is the difference of a
 take's own frame numbers, which may begin at 0, from the file's.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,13 +28,25 @@ INTEL, DEC, MIPS = 84, 85, 86  # processor types: byte order and floats
 RESIDUAL_SCALE_MM = 0.1
 MOST_WORD = 65535  # of the header's 16-bit numbers
 BATCH = 255  # labels in one parameter
+POSE = 17  # numbers per segment and frame
+Found = TypeVar("Found")
 
 
-def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "mm") -> None:
-    """Write points as float32; sigmas as residuals in steps of 0.1 mm, from 0.1 to 25.5 mm.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Segments:
+    """Poses of S rigid segments over T frames; NaN where a pose is unknown."""
+
+    names: tuple[str, ...]
+    frames: np.ndarray  # (T,) integer frame numbers
+    R: np.ndarray  # (T, S, 3, 3) the columns are the segment's axes in the world
+    origin_m: np.ndarray  # (T, S, 3) world
+
+
+def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "mm", segments: Segments | None = None) -> None:
+    """Write points as float32, sigmas as residuals in steps of 0.1 mm, from 0.1 to 25.5 mm; and the poses of segments in the same frames.
 
     Raises:
-        InputError: axes or unit are not known, the frames go back or are too far apart, or the file cannot be written.
+        InputError: axes or unit are not known, the frames go back, are too far apart or too many, or the file cannot be written.
     """
     markers = without_gaps(markers, path)
     per_unit = metres_per(unit, path)
@@ -43,10 +58,30 @@ def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "
     data = np.concatenate([np.where(known[..., None], xyz, 0.0), np.where(known, steps, -1.0)[..., None]], axis=2).astype("<f4")
     first = int(markers.frames[0]) if 1 <= markers.frames[0] and markers.frames[-1] <= MOST_WORD else 1
     last = first + t - 1
-    start = 2 + len(_parameters(markers, scale, unit, first)) // BLOCK
-    parameters = _parameters(markers, scale, unit, first, start)
+    names = segments.names if segments is not None else ()
+    start = 2 + len(_parameters(markers, scale, unit, first, names)) // BLOCK
+    points = _padded(data.tobytes())
+    poses_start = start + len(points) // BLOCK
+    if names and poses_start > MOST_WORD:
+        raise InputError(
+            f"{path} cannot be written: C3D has room for poses after {MOST_WORD * BLOCK / 1e6:.0f} MB of points only; export fewer frames."
+        )
+    parameters = _parameters(markers, scale, unit, first, names, start, poses_start)
+    poses = _poses(segments, markers.frames, axes_of(axes), per_unit) if segments is not None else b""
     header = struct.pack("<BB5HfHHf", 2, 0x50, n, 0, first, min(last, MOST_WORD), 0, -scale, start, 0, markers.fps)
-    store.write_bytes(Path(path), header.ljust(BLOCK, b"\0") + parameters + _padded(data.tobytes()))
+    store.write_bytes(Path(path), header.ljust(BLOCK, b"\0") + parameters + points + poses)
+
+
+def _poses(segments: Segments, frames: np.ndarray, A: np.ndarray, per_unit: float) -> bytes:
+    """The data of the segments in these frames, in the file's axes and unit; frames without a pose are unknown."""
+    table = np.full((len(frames), len(segments.names), POSE), np.nan)
+    rows = np.rint(segments.frames).astype(np.int64) - frames[0]
+    inside = (rows >= 0) & (rows < len(frames))
+    pose = np.zeros((int(inside.sum()), len(segments.names), 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = A @ segments.R[inside], segments.origin_m[inside] @ A.T / per_unit, 1.0
+    table[rows[inside], :, :16] = np.swapaxes(pose, -1, -2).reshape(*pose.shape[:2], 16)
+    table[..., 16] = np.where(np.isfinite(table[..., :16]).all(axis=-1), 0.0, -1.0)
+    return _padded(table.astype("<f4").tobytes())
 
 
 def without_gaps(markers: Markers, where: object) -> Markers:
@@ -74,8 +109,11 @@ def _padded(data: bytes) -> bytes:
     return data + b"\0" * (-len(data) % BLOCK)
 
 
-def _parameters(markers: Markers, scale: float, unit: str, first: int, start: int = 0) -> bytes:
-    """The parameters of points without gaps, the first frame having the number `first`, the data beginning in block `start`."""
+def _parameters(
+    markers: Markers, scale: float, unit: str, first: int, segments: tuple[str, ...], start: int = 0, poses_start: int = 0
+) -> bytes:
+    """The parameters of points without gaps, the first frame having the number `first`, the data beginning in block `start`, and of the
+    `segments`, whose data begin in block `poses_start`."""
     t, n = len(markers.frames), len(markers.names)
     last = first + t - 1
     point: list[tuple[str, Any]] = [
@@ -86,15 +124,15 @@ def _parameters(markers: Markers, scale: float, unit: str, first: int, start: in
         ("RATE", np.float32(markers.fps)),
         ("UNITS", unit),
     ]
-    for k in range(0, n, BATCH):
-        number = "" if k == 0 else str(k // BATCH + 1)
-        point.append((f"LABELS{number}", markers.names[k : k + BATCH]))
-        point.append((f"DESCRIPTIONS{number}", tuple("" for _ in markers.names[k : k + BATCH])))
+    point += _named(markers.names)
     trial: list[tuple[str, Any]] = [
         ("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
         ("ACTUAL_END_FIELD", np.array([last & 0xFFFF, last >> 16], dtype=np.uint16)),
     ]
     groups = [("POINT", point), ("ANALOG", [("USED", np.uint16(0))]), ("TRIAL", trial)]
+    if segments:
+        used: list[tuple[str, Any]] = [("USED", np.uint16(len(segments))), ("DATA_START", np.uint16(poses_start)), ("RATIO", np.uint16(1))]
+        groups.append(("ROTATION", [*used, ("RATE", np.float32(markers.fps)), *_named(segments)]))
     offset = (int(markers.frames[0]) - first) & 0xFFFFFFFF
     if offset:
         groups.append(("TRICAP", [("FRAME_OFFSET", np.array([offset & 0xFFFF, offset >> 16], dtype=np.uint16))]))
@@ -103,6 +141,15 @@ def _parameters(markers: Markers, scale: float, unit: str, first: int, start: in
     body += b"".join(entries) + b"\0\0"
     blocks = -(-(len(body) + 4) // BLOCK)
     return _padded(struct.pack("<BBBB", 1, 0x50, blocks, INTEL) + body)
+
+
+def _named(names: tuple[str, ...]) -> list[tuple[str, Any]]:
+    """The parameters with the names of points or segments."""
+    rows: list[tuple[str, Any]] = []
+    for k in range(0, len(names), BATCH):
+        number = "" if k == 0 else str(k // BATCH + 1)
+        rows += [(f"LABELS{number}", names[k : k + BATCH]), (f"DESCRIPTIONS{number}", tuple("" for _ in names[k : k + BATCH]))]
+    return rows
 
 
 def _entry(name: str, number: int, rest: bytes) -> bytes:
@@ -147,7 +194,19 @@ def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
     Raises:
         InputError: it cannot be read, is no C3D file, or is shorter than its header says.
     """
-    rotation = axes_of(axes)
+    return _opened(path, lambda data: _read(data, path, axes_of(axes), unit))
+
+
+def read_segments(path: Path, *, axes: str = "Z up", unit: str = "") -> Segments | None:
+    """Read the poses of segments, in the file's unit unless `unit` says otherwise; None where the file has none.
+
+    Raises:
+        InputError: it cannot be read, is no C3D file, or is shorter than its header says.
+    """
+    return _opened(path, lambda data: _read_segments(data, path, axes_of(axes), unit))
+
+
+def _opened(path: Path, read: Callable[[bytes], Found]) -> Found:
     try:
         data = bounded.bytes_of(path, bounded.TABLE_BYTES)
     except OSError as error:
@@ -155,9 +214,31 @@ def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
     if len(data) < 2 * BLOCK or data[1] != 0x50 or data[0] < 2:
         raise InputError(f"{path} is not a C3D file; export it again.")
     try:
-        return _read(data, path, rotation, unit)
+        return read(data)
     except (struct.error, IndexError, ValueError, KeyError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is a damaged C3D file ({error}); export it again.") from error
+
+
+def _read_segments(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Segments | None:
+    at = (data[0] - 1) * BLOCK
+    number = _Number(order=">" if data[at + 3] == MIPS else "<", dec=data[at + 3] == DEC)
+    table = _read_parameters(data, at, number, path)
+    n, begin = (int(table.get(("ROTATION", name), 0)) for name in ("USED", "DATA_START"))
+    if n == 0:
+        return None
+    words = number.words(data[2:24])
+    first, t = _range(table, int(words[2]), int(words[3]))
+    check_size((t, n, POSE, 4), len(data), path)
+    begin = (begin - 1) * BLOCK
+    if int(table.get(("ROTATION", "RATIO"), 1)) != 1 or begin < BLOCK or begin + 4 * t * n * POSE > len(data):
+        raise InputError(f"{path} promises {t} poses of {n} segments but is too short for them; export it again, one pose per frame.")
+    raw = number.floats(data[begin : begin + 4 * t * n * POSE]).astype(np.float64).reshape(t, n, POSE)
+    pose = np.swapaxes(raw[..., :16].reshape(t, n, 4, 4), -1, -2)
+    pose[raw[..., 16] < 0] = np.nan
+    per_unit = metres_per(unit or table.get(("POINT", "UNITS"), "mm") or "mm", path)
+    frames = first + _offset(table) + np.arange(t)
+    names = _labels(table, n, "ROTATION")
+    return Segments(names=names, frames=frames, R=rotation.T @ pose[..., :3, :3], origin_m=pose[..., :3, 3] * per_unit @ rotation)
 
 
 def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
@@ -202,10 +283,10 @@ def _offset(table: dict[tuple[str, str], Any]) -> int:
     return value - (1 << 32) if value >= 1 << 31 else value
 
 
-def _labels(table: dict[tuple[str, str], Any], n: int) -> tuple[str, ...]:
+def _labels(table: dict[tuple[str, str], Any], n: int, group: str = "POINT") -> tuple[str, ...]:
     names: list[str] = []
     for k in range(1, n // BATCH + 2):
-        names += table.get(("POINT", "LABELS" if k == 1 else f"LABELS{k}"), ())
+        names += table.get((group, "LABELS" if k == 1 else f"LABELS{k}"), ())
     names = names[:n] + [f"point {i + 1}" for i in range(len(names), n)]
     seen: dict[str, int] = {}
     for i, name in enumerate(names):
