@@ -208,7 +208,7 @@ def lint() -> int:
     """Style and format of everything, types of the core."""
     python = venv_program("python")
     checks = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
-    return max(run(python, "-m", *check) for check in checks)
+    return max(run(python, "-P", "-m", *check) for check in checks)
 
 
 def demo(out: str) -> int:
@@ -217,11 +217,14 @@ def demo(out: str) -> int:
 
 
 def test(everything: bool, pytest_arguments: list[str]) -> int:
-    """Lint, types and tests; without `--all` the slow tests are left out. A process per core, each file in one of them (`-n0`: in none)."""
+    """Lint, types and tests; without `--all` the slow tests are left out. A process per core, each file in one of them (`-n0`: in none).
+
+    `-P`: a file of the repository's root that happens to be called numpy.py is no module.
+    """
     selection = [] if everything or "-m" in pytest_arguments else ["-m", "not slow"]
     processes = ["-n", str(min(os.cpu_count() or 1, 4)), "--dist", "loadfile"]
     linted = lint()
-    tested = run(venv_program("python"), "-m", "pytest", *processes, *selection, *pytest_arguments)
+    tested = run(venv_program("python"), "-P", "-m", "pytest", *processes, *selection, *pytest_arguments)
     say(f"lint and types: {'failed' if linted else 'passed'}; tests: {'failed' if tested else 'passed'}")
     return linted or tested
 
