@@ -14,6 +14,7 @@ from ...core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, app
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig, controls_of
+from . import saved_maps
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, store_residual_motion, write_action
@@ -64,8 +65,14 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
     Raises:
         InputError: the armature cannot be mapped, or the mapping names bones that it does not have.
     """
+    if armature_object.library is not None:
+        raise InputError(
+            f"“{armature_object.name}” is linked from {Path(armature_object.library.filepath).name} and cannot be animated here; "
+            "make a library override of it (Object > Library Override > Make)."
+        )
     rig = read_rig(armature_object)
-    rig_map = map_of(rig, map_file, controls=True)
+    known = saved_maps.found_again(rig) if map_file is None and edited is None else None
+    rig_map = known or map_of(rig, map_file, controls=True)
     if edited is not None:
         rig_map = _edited(rig, rig_map, edited)
     if rig_map.control_rig is not None:

@@ -1,29 +1,35 @@
 """The mapping's editor: bpy.ops.tricap.retarget_find_map(), .retarget_load_map(filepath="…"), .retarget_save_map(filepath="…"),
-.retarget_add_line(), .retarget_remove_line()"""
+.retarget_add_line(), .retarget_remove_line(), .retarget_align_pose()"""
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
 from ...core.foundation.errors import InputError
-from ...core.motion.retarget.mapping import write_map
+from ...core.motion.retarget.mapping import MappedMotion, write_map
+from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.roles import ROLES
+from ...core.motion.retarget.transfer import offsets_of_pose
 from ..panels import TellingOperator
-from . import apply, properties
+from . import apply, properties, saved_maps
 from .operators import armature_of
-from .read import read_rig
+from .read import action_frames, read_motion, read_pose, read_rig
 
 
 def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Path | None) -> str:
-    """Fill the editor with the target's mapping, recognised or from a file.
+    """Fill the editor with the target's mapping: from a file, recognised, or, while it is empty, that of the last time.
 
     Raises:
         InputError: there is no target, or the file is no mapping for it.
     """
     props = context.scene.tricap_retarget
     target = armature_of("", props.target, "target")
-    rig_map = apply.map_of(read_rig(target), file, controls=True)
-    properties.fill_rows(props, rig_map, target)
+    rig, begins = read_rig(target), not props.rows or props.rows_of != target
+    known = saved_maps.found_again(rig) if file is None and begins else None
+    rig_map = known or apply.map_of(rig, file, controls=True)
+    source = apply.map_of(read_rig(props.source)) if props.source is not None else None
+    properties.fill_rows(props, rig_map, target, source)
     for line in (*rig_map.missing_notes, *rig_map.notes):
         operator.report({"INFO"}, line)
     return ""
@@ -131,4 +137,32 @@ class RemoveLine(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (FindMap, LoadMap, SaveMap, AddLine, RemoveLine)
+class AlignPose(TellingOperator, bpy.types.Operator):
+    """Pose the target by hand like the source in this frame, then press: the differences become rotation offsets of the mapping"""
+
+    bl_idname = "tricap.retarget_align_pose"
+    bl_label = "Align to Pose"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only with an armature as the source, and a target."""
+        props = context.scene.tricap_retarget
+        return props.source is not None and props.target is not None
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Fill in the offsets."""
+        props, frame = context.scene.tricap_retarget, context.scene.frame_current
+        source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
+        apply.check_distinct(source, target)
+        mapped = apply.read_target(target, edited=properties.edited_map(props, target))
+        posed = MappedMotion(motion=read_pose(target, mapped.rig, frame), map=mapped.rig_map)
+        rig = read_rig(source)
+        frames = sorted({frame, *action_frames(source)})
+        moving, _ = with_person_like_rest(MappedMotion(motion=read_motion(source, rig, frames), map=apply.map_of(rig)))
+        offsets = offsets_of_pose(moving, frames.index(frame), posed)
+        properties.fill_rows(props, replace(mapped.rig_map, offsets_deg=offsets), target, moving.map)
+        return f"{len(offsets)} parts of {target.name} have a rotation offset now."
+
+
+CLASSES = (FindMap, LoadMap, SaveMap, AddLine, RemoveLine, AlignPose)

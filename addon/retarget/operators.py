@@ -17,7 +17,7 @@ from ...core.motion.sources import read_motion_source
 from ..jobs import JobOperator
 from ..panels import TellingOperator
 from ..properties import snapshot
-from . import apply, preview, properties
+from . import apply, preview, properties, saved_maps
 from .read import action_frames, read_motion, read_rig, with_residual_motion
 from .write import push_to_strip
 
@@ -63,6 +63,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         if moving is not None:
             apply.check_distinct(moving, self._target)
         edited = properties.edited_map(props, self._target) if not self.map else None
+        self._edited = edited
         self._unused_mapping = properties.foreign_mapping_note(props, self._target) if not self.map else ""
         self._mapped_target = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
         target, scene = self._mapped_target, context.scene
@@ -83,6 +84,8 @@ class Retarget(JobOperator, bpy.types.Operator):
         preview.remove_preview(self._target)
         beside = begun_at_rest(result.result) if props.place == "SIDE" else result.result
         outcome = apply.apply(self._target, result.source, self._mapped_target, beside, self._name, props.tolerance_deg)
+        if self._edited is not None:
+            saved_maps.keep(read_rig(self._target), self._edited, self._target.name)
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused_mapping]), *outcome.notes]

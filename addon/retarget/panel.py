@@ -17,10 +17,13 @@ class TRICAP_UL_map(bpy.types.UIList):
     """The lines of the mapping."""
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
-        """Part and bones."""
+        """Part, the source's bones, the target's bones."""
         row = layout.row(align=True)
         row.prop(item, "role", text="", emboss=False)
+        row.label(text=item.source or "–")
         row.prop(item, "bones", text="", emboss=False)
+        if any(item.offset):
+            row.label(text="", icon="ORIENTATION_GIMBAL")
         if item.twist:  # edited below the list
             row.label(text="", icon="CON_ROTLIKE")
 
@@ -34,6 +37,9 @@ def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
     buttons.operator("tricap.retarget_remove_line", icon="REMOVE", text="")
     if 0 <= props.row < len(props.rows):
         layout.prop(props.rows[props.row], "twist")
+        layout.prop(props.rows[props.row], "offset")
+    if props.source is not None:
+        layout.operator("tricap.retarget_align_pose", icon="POSE_HLT")
     buttons = layout.row(align=True)
     buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
     buttons.operator("tricap.retarget_load_map", icon="FILE_FOLDER", text="Load")
@@ -56,7 +62,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             row.prop(props, "up")
             row.prop(props, "unit")
     column.prop(props, "target")
-    header, body = layout.panel("tricap_retarget_map", default_closed=True)
+    header, body = layout.panel("tricap_retarget_map", default_closed=not props.rows)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (automatic)")
     if body is not None:
         _draw_map(body, props)

@@ -13,9 +13,9 @@ from mathutils import Matrix
 
 from ...core.foundation.errors import InputError
 from ...core.motion.retarget.mapping import MappedRig, RigMap
-from ...core.motion.retarget.retarget import leg_ratio
+from ...core.motion.retarget.retarget import leg_ratio, nothing_in_common
 from ...core.motion.retarget.roles import part_of
-from ...core.motion.retarget.transfer import alignments, untwisted_bone
+from ...core.motion.retarget.transfer import alignments, untwisted_bone, with_offsets
 
 NAME = "Tricap preview"
 EARLIER_KEY = "tricap_before_preview"  # custom property of the target: the earlier values of its controls' properties
@@ -28,9 +28,9 @@ def add_preview(source: bpy.types.Object, source_rig: MappedRig, target: bpy.typ
         InputError: source and target have no part of the body in common.
     """
     remove_preview(target)
-    aligned = alignments(source_rig, target_rig)
+    aligned = with_offsets(alignments(source_rig, target_rig), target_rig)
     if not aligned:
-        raise InputError("Source and target have no part of the body in common; check the two mappings.")
+        raise InputError(nothing_in_common(source_rig.map, target_rig.map))
     collection = bpy.data.collections.new(NAME)
     bpy.context.scene.collection.children.link(collection)
     count = 0

@@ -1,6 +1,7 @@
 """The settings of retargeting in the scene: `scene.tricap_retarget`."""
 
 import json
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -45,10 +46,17 @@ def axes_of_file(props: Any) -> dict[str, str]:
 
 
 class MapRow(bpy.types.PropertyGroup):
-    """One line of the mapping: a part of the body, and its bones in the target, separated by commas."""
+    """One line of the mapping: a part of the body, its bones in source and target, separated by commas, and a rotation offset."""
 
     role: bpy.props.EnumProperty(name="Part", items=[(role, role, "") for role in ROLES])  # type: ignore[valid-type]
     bones: bpy.props.StringProperty(name="Bones", description="Bones of this part from the body outwards, separated by commas")  # type: ignore[valid-type]
+    source: bpy.props.StringProperty(name="Source", description="Bones of this part in the source, as recognised")  # type: ignore[valid-type]
+    offset: bpy.props.FloatVectorProperty(  # type: ignore[valid-type]
+        name="Rotation Offset",
+        subtype="EULER",
+        size=3,
+        description="Turns this part of the target about its own axes in the rest pose, in all frames",
+    )
     twist: bpy.props.StringProperty(name="Twist", description="Twist bones of this part, separated by commas")  # type: ignore[valid-type]
 
 
@@ -118,12 +126,14 @@ class Retargeting(bpy.types.PropertyGroup):
     last_export: bpy.props.StringProperty()  # type: ignore[valid-type]  # what was exported since
 
 
-def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object) -> None:
-    """Show the mapping of a target in the editor."""
+def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object, source: RigMap | None = None) -> None:
+    """Show the mapping of a target in the editor, next to that of the source."""
     props.rows.clear()
     for role, chain in rig_map.bones.items():
         row = props.rows.add()
         row.role, row.bones, row.twist = role, ", ".join(chain), ", ".join(rig_map.twist.get(role, ()))
+        row.source = ", ".join(source.bones.get(role, ())) if source is not None else ""
+        row.offset = [math.radians(angle) for angle in rig_map.offsets_deg.get(role, (0.0, 0.0, 0.0))]
     props.rows_of, props.row = target, 0
     props.steering = json.dumps(rig_map.control_rig.table()) if rig_map.control_rig is not None else ""
     props.missing = "\n".join((*rig_map.missing_notes, *rig_map.notes))
@@ -152,7 +162,9 @@ def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
     except ValueError as error:
         raise InputError(f"The mapping in this .blend file is damaged ({error}); press Recognise to make it again.") from error
     control_rig = control_rig_of(table, {"L": "L", "R": "R"}, "The mapping in this .blend file") if table is not None else None
-    return RigMap(bones=bones, twist=twist, origin="the panel", control_rig=control_rig and control_rig.of_controls(bones, twist))
+    offsets = {row.role: tuple(math.degrees(angle) for angle in row.offset) for row in props.rows if row.role in bones and any(row.offset)}
+    controls = control_rig and control_rig.of_controls(bones, twist)
+    return RigMap(bones=bones, twist=twist, origin="the panel", control_rig=controls, offsets_deg=offsets)
 
 
 def foreign_mapping_note(props: Any, target: bpy.types.Object) -> str:

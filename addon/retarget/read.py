@@ -134,6 +134,14 @@ VRM = {"hips": "hips", "head": "head"} | {
 }
 
 
+def read_pose(armature_object: bpy.types.Object, rig: Rig, frame: int) -> Motion:
+    """The pose of an armature as it stands now, also if it has no keys yet, as a motion of one frame."""
+    world = world_matrix(armature_object)
+    matrices = np.array([armature_object.pose.bones[name].matrix for name in rig.names])
+    R, head_m = orthonormal(world[:3, :3] @ matrices[:, :3, :3]), _moved(world, [*matrices[:, :3, 3]])
+    return Motion(rig=rig, fps=1.0, frames=np.array([frame]), R=R[None], head_m=head_m[None])
+
+
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
     """The rig with the sole points of its feet, from the skins that it deforms: the points that would touch a floor at various tilts."""
     wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]

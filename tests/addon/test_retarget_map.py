@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from mathutils import Euler
 
 from tricap.addon.retarget.build import build_armature
 from tricap.core.motion.formats.bvh import write_bvh
@@ -19,7 +20,9 @@ from .layout import Layout
 
 @pytest.fixture
 def props(blender: ModuleType) -> Any:
-    """The panel, with a source that squats and a target."""
+    """The panel, with a source that squats and a target whose rig was never mapped."""
+    saved_maps = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.saved_maps")
+    saved_maps.file_of(person()).unlink(missing_ok=True)
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     props = blender.context.scene.tricap_retarget
     props.source, props.target = build_armature(squat(person(), frames=4), "Source"), armature(person(), "Target")
@@ -124,3 +127,57 @@ def test_a_preview_can_be_ended_while_there_is_one(blender: ModuleType, props: A
 
     assert not offered() and ops.retarget_preview() == {"FINISHED"} and offered()
     assert ops.retarget_end_preview() == {"FINISHED"} and not offered()
+
+
+def test_a_posed_target_is_aligned_and_its_mapping_is_found_again(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    ops, target = blender.ops.tricap, props.target
+    saved_maps = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.saved_maps")
+    file = saved_maps.file_of(importlib.import_module("bl_ext.user_default.tricap.addon.retarget.read").read_rig(target))
+    try:
+        target.animation_data_clear()
+        assert ops.retarget_find_map() == {"FINISHED"}
+        rows = {row.role: row for row in props.rows}
+        assert rows["hand.L"].source == rows["hand.L"].bones == "hand.L"
+        assert ops.retarget() == {"FINISHED"}
+        blender.context.scene.frame_set(2)
+        before = target.pose.bones["hand.L"].matrix.copy()
+        target.animation_data.action = None
+        target.pose.bones["hand.L"].matrix = before @ Euler((0.5, 0.0, 0.0)).to_matrix().to_4x4()
+        blender.context.view_layer.update()
+        assert ops.retarget_align_pose() == {"FINISHED"}
+        rows = {row.role: tuple(row.offset) for row in props.rows if any(row.offset)}
+        assert rows["hand.L"] == pytest.approx((0.5, 0.0, 0.0), abs=1e-4)
+        assert not {"hand.R", "head", "forearm.L", "upper_arm.R"} & rows.keys()
+        assert ops.retarget() == {"FINISHED"}
+        blender.context.scene.frame_set(2)
+        turned = before.to_3x3().inverted() @ target.pose.bones["hand.L"].matrix.to_3x3()
+        assert turned.to_euler().x == pytest.approx(0.5, abs=2e-3)
+        props.rows.clear()
+        assert ops.retarget_find_map() == {"FINISHED"}
+        assert {row.role: row.offset[0] for row in props.rows}["hand.L"] == pytest.approx(0.5, abs=1e-4), "found again"
+        assert ops.retarget_find_map() == {"FINISHED"} and not any(any(row.offset) for row in props.rows), "recognised anew"
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def test_linked_and_overridden_characters(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    source, target = props.source, props.target
+    target.animation_data_clear()
+    blender.data.libraries.write(str(tmp_path / "hero.blend"), {target})
+    blender.data.objects.remove(target)
+    with blender.data.libraries.load(str(tmp_path / "hero.blend"), link=True) as (_, found):
+        found.objects = ["Target"]
+    linked = found.objects[0]
+    blender.context.scene.collection.objects.link(linked)
+    props.source, props.target = source, linked
+    with pytest.raises(RuntimeError, match="is linked from hero.blend and cannot be animated here"):
+        blender.ops.tricap.retarget()
+    own = linked.override_create(remap_local_usages=True)
+    blender.context.view_layer.update()
+    props.target = own
+    assert blender.ops.tricap.retarget() == {"FINISHED"}
+    assert own.animation_data.action is not None and own.override_library is not None
+    blender.context.scene.frame_set(3)
+    first = own.pose.bones["thigh.L"].matrix.copy()
+    blender.context.scene.frame_set(1)
+    assert own.pose.bones["thigh.L"].matrix != first, "it moves"

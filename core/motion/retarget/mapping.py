@@ -20,6 +20,7 @@ from .shape import ShapeMatch, by_shape
 FITS = 0.9  # fraction of a preset's bones that a rig must have for the preset to be chosen
 LIMB_ROLES = 8  # a rig with whole limbs but at most so many parts is a limb or half a body, not an unrecognised person
 HEAD_OFF_AXIS = 0.02  # by the rig's height: the bones of neck and head are not farther from the chest's vertical
+MOST_DEG = 360.0  # of a rotation offset
 MOST_ON_NECK = 3  # a bone with more children is not part of a neck
 NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
 
@@ -27,7 +28,8 @@ NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm"
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigMap:
     """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, the twist bones. `restored`: roles that the rig
-    lacks, whose rotations come from the residual motion."""
+    lacks, whose rotations come from the residual motion. `offsets_deg`: by role, a rotation of the target's part relative to
+    the source's, as Euler angles XYZ [°] about the part's axes in its rest pose."""
 
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
@@ -36,6 +38,7 @@ class RigMap:
     origin: str = "names"
     control_rig: ControlRig | None = None  # of a rig whose mapped bones are controls
     restored: frozenset[str] = frozenset()
+    offsets_deg: Map[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def first(self, role: str) -> str | None:
         """The bone at whose head the part begins."""
@@ -85,6 +88,7 @@ class Preset:
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
     prefixes: tuple[str, ...] = ("",)
     control_rig: ControlRig | None = None
+    offsets_deg: Map[str, tuple[float, float, float]] = field(default_factory=dict)
 
 
 def read_preset(path: Path) -> Preset:
@@ -102,7 +106,19 @@ def read_preset(path: Path) -> Preset:
         raise InputError(f'{path} has invalid “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
     control_rig = control_rig_of(table["steering"], sides, path) if "steering" in table else None
-    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), control_rig=control_rig, **parts)
+    offsets = _offsets(table.get("offsets_deg", {}), path)
+    name = str(table.get("name", Path(path).stem))
+    return Preset(name=name, prefixes=tuple(prefixes), control_rig=control_rig, offsets_deg=offsets, **parts)
+
+
+def _offsets(table: Any, path: Path) -> dict[str, tuple[float, float, float]]:
+    rows: dict[str, tuple[float, float, float]] = {}
+    for role, angles in table.items() if isinstance(table, dict) else ():
+        valid = isinstance(angles, list) and len(angles) == 3 and all(isinstance(a, (int, float)) and abs(a) <= MOST_DEG for a in angles)
+        if role not in ROLES or not valid:
+            raise InputError(f"{path} has no three angles in degrees for a part of the body at “{str(role)[:40]}” in “offsets_deg”.")
+        rows[role] = (float(angles[0]), float(angles[1]), float(angles[2]))
+    return rows
 
 
 def control_rig_of(table: Any, sides: Map[str, str], path: Path | str) -> ControlRig:
@@ -162,6 +178,7 @@ def write_map(path: Path, rig_map: RigMap, name: str) -> None:
     store.write_json(
         path,
         {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()}, "twist": {r: list(c) for r, c in rig_map.twist.items()}}
+        | ({"offsets_deg": {r: list(angles) for r, angles in rig_map.offsets_deg.items()}} if rig_map.offsets_deg else {})
         | ({"steering": control_rig.table()} if control_rig is not None else {}),
     )
 
@@ -185,6 +202,7 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
         missing=missing,
         origin=f"mapping “{preset.name}”",
         control_rig=preset.control_rig,
+        offsets_deg={role: angles for role, angles in preset.offsets_deg.items() if role in bones},
     )
 
 
@@ -402,6 +420,7 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
         missing={**found.missing, **unrecognised},
         notes=found.notes + ((f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()),
         origin=found.origin,
+        offsets_deg=found.offsets_deg,
     )
 
 

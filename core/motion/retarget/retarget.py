@@ -21,11 +21,12 @@ from .rest_pose import TargetPose, hip_centre, loose_parts, with_person_like_res
 from .restore import lacking, planting_turns, turned_by, with_residual
 from .rig import Motion, Rig, channels, head_of
 from .roles import SEGMENTS, SIDES, sided
-from .transfer import alignments, body_axes, share_twist, turn
+from .transfer import alignments, body_axes, share_twist, turn, with_offsets
 
 SHORTEST_LIMB_M = 1e-4
 LYING = 0.3  # height of the head over the hips by their distance: a lower median means that the source lies
 STEPS = 4
+PARTS_NAMED = 4  # in a sentence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,14 +150,28 @@ def _matched(
         _check_lengths(mapped, which)
     aligned = alignments(source.mapped_rig, target)
     if not aligned:
-        raise InputError("Source and target have no part of the body in common; check the two mappings.")
+        raise InputError(nothing_in_common(source.map, target.map))
     scale = scale or leg_ratio(source.mapped_rig, target)
     leg_m = _leg_m(source.rig, source.map) or source.rig.height_m / 2
     contacts = contacts or find_contacts(source.motion, source.map, settings, leg_m)
     legs = feet.find_legs(target.rig, target.map, floor_m) if "hips" in aligned else {}
     if contacts is not None:
         aligned = aligned | _level(source, aligned, contacts)
+    aligned = with_offsets(aligned, target)
     return _Match(source=source, target=target, aligned=aligned, scale=scale, contacts=contacts, legs=legs, floor_m=floor_m)
+
+
+def nothing_in_common(source: RigMap, target: RigMap) -> str:
+    """A sentence that names the parts of two rigs that share none."""
+
+    return (
+        f"Source and target have no part of the body in common: the source has {_parts(source)}, the target {_parts(target)}. "
+        "Choose another source, or correct the mapping."
+    )
+
+
+def _parts(rig_map: RigMap) -> str:
+    return ", ".join([*rig_map.bones][:PARTS_NAMED]) + (" …" if len(rig_map.bones) > PARTS_NAMED else "")
 
 
 def _motion(source: Motion, pose: TargetPose, residual: ResidualMotion | None = None) -> Motion:
@@ -208,7 +223,10 @@ def _lone_forearm_twists(target: MappedRig, before: np.ndarray, after: np.ndarra
 def _notes(match: _Match) -> tuple[str, ...]:
     lost = [role for role in match.source.map.bones if role not in match.target.map.bones and "." not in role[:-2]]
     notes = [f"the target has no {', '.join(lost)}: their parents take up the motion"] if lost else []
-    return (*notes, *([] if "hips" in match.aligned else ["the body does not travel: source and target have no hips in common"]))
+    if "hips" not in match.aligned:
+        which, rig_map = ("target", match.target.map) if "hips" in match.source.map.bones else ("source", match.source.map)
+        notes.append(f"the body does not travel: the {which} has no hips, only {_parts(rig_map)}")
+    return tuple(notes)
 
 
 def lying_note(source: MappedMotion) -> str:

@@ -17,7 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.rotation import about, between, rotate, shortest, transposed, twist_about, unit
+from ...geometry.rotation import (
+    about,
+    angle_of,
+    between,
+    euler_from_matrix,
+    matrix_from_euler,
+    rotate,
+    shortest,
+    transposed,
+    twist_about,
+    unit,
+)
 from .mapping import MappedMotion, MappedRig, RigMap
 from .rig import Motion, Rig, following
 from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, sided
@@ -25,6 +36,7 @@ from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, side
 UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans by less counts as upright
 LEVEL = 0.35  # a foot whose direction has a smaller horizontal component has no heading
 LONE_FOREARM = 0.5  # fraction of the hand's twist that a forearm without twist bones takes
+SAME_DEG = 0.05  # between a posed part and its source: no offset
 SHORTEST_M = 1e-9  # bones below this length count as equally long
 
 Nodes = tuple[np.ndarray, np.ndarray]  # fractions (N,) along a chain, and rotations since rest (N, T, 3, 3)
@@ -94,6 +106,30 @@ def alignments(source: MappedRig, target: MappedRig) -> dict[str, np.ndarray]:
             A = body
         aligned[role] = A
     return aligned
+
+
+def with_offsets(aligned: Mapping[str, np.ndarray], target: MappedRig) -> dict[str, np.ndarray]:
+    """The alignments with the rotation offsets of the target's mapping: A · R_t,rest · O · R_t,restᵀ."""
+    turned = dict(aligned)
+    for role in aligned.keys() & target.map.offsets_deg.keys():
+        R_rest = target.rig.R_rest[target.rig.index[target.map.bones[role][0]]]
+        O = matrix_from_euler(np.radians(target.map.offsets_deg[role]), "XYZ")
+        turned[role] = aligned[role] @ R_rest @ O @ R_rest.T
+    return turned
+
+
+def offsets_of_pose(source: MappedMotion, row: int, target: MappedMotion) -> dict[str, tuple[float, float, float]]:
+    """The offsets [°] with which the target has the pose of its first frame when the source has that of frame number `row`; parts without
+    a difference are left out. Each part is compared by the first of its bones."""
+    offsets: dict[str, tuple[float, float, float]] = {}
+    for role, A in alignments(source.mapped_rig, target.mapped_rig).items():
+        s, t = (mapped.rig.index[mapped.map.bones[role][0]] for mapped in (source, target))
+        D = source.motion.R[row, s] @ source.rig.R_rest[s].T
+        O = (D @ A @ target.rig.R_rest[t]).T @ target.motion.R[0, t]
+        angles = np.degrees(euler_from_matrix(O[None], "XYZ")[0])
+        if np.degrees(angle_of(O)) > SAME_DEG:
+            offsets[role] = (float(angles[0]), float(angles[1]), float(angles[2]))
+    return offsets
 
 
 def _heading(source: MappedRig, target: MappedRig, role: str, body: np.ndarray) -> np.ndarray:
