@@ -22,6 +22,7 @@ import numpy as np
 from ..foundation.arrays import frozen
 from ..geometry.robust import mad_sigma
 from .background import EMPTY_SHARE, OTHER_ROOM
+from .second_look import CLEAR, NEVER, look_cost, second_is_background
 
 FEWEST = 5  # images for a background
 FEWEST_BARE = 3  # of these, without anybody near the cell
@@ -82,8 +83,26 @@ def still_background(
     certain = bare_width < TIGHT * noise
     grey = np.where(certain, bare, grey)
     known = np.where(certain, 1.0, np.where(width < TIGHT * noise, LINGERING, 0.0))
+    second, gain = _second_look(images, seen, grey, noise)
+    grey = np.where(gain > CLEAR, second, grey)
+    known = np.where(gain > CLEAR, 1.0, np.where(gain > 0, 0.0, known))
     known[_same_when_seen(images, seen, grey, noise)] = 0.0
     return CellBackground(grey=grey, noise=noise, known=known, cell_px=cell_px)
+
+
+def _second_look(images: Sequence[np.ndarray], seen: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """How cells (h, w) look where they do not look as `grey`, and what speaks for that as the background (`second_look`)."""
+    others = sum((np.abs(image - grey) >= TIGHT * noise).astype(int) for image in images)
+    at = np.nonzero(others >= FEWEST_BARE)
+    values, measured = (np.stack([cells[at] for cells in of]) for of in (images, seen))
+    first = np.abs(values - grey[at]) < TIGHT * noise
+    look, width = _tightest(np.sort(np.where(first, np.inf, values), axis=0), (~first).sum(axis=0))
+    also = (width < TIGHT * noise) & (np.abs(values - look) < TIGHT * noise) & ~first
+    second, costs = np.array(grey), (np.zeros(grey.shape), np.full(grey.shape, NEVER))
+    second[at] = look
+    for cost, like in zip(costs, (first, also)):
+        cost[at] = look_cost(like.sum(axis=0), (like & measured).sum(axis=0))
+    return second, second_is_background(grey, second, *costs, noise)
 
 
 def _same_when_seen(images: Sequence[np.ndarray], seen: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> np.ndarray:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tricap.core.images.foreground import FEWEST, CellBackground, cells, given_background, person, still_background
+from tricap.core.images.second_look import CLEAR, look_cost, second_is_background
 
 SIZE = (90, 140)  # of an image in cells
 NOISE = 1.5  # grey values, of a cell
@@ -49,7 +50,7 @@ def test_a_person_in_print() -> None:
     images = _walk(110 + PRINT)
     background = _background(images)
     assert np.abs(background.grey - WALL).mean() < NOISE and 0.8 * NOISE < background.noise < 1.5 * NOISE
-    assert (background.known == 1).all() and background.cell_px == 4
+    assert (background.known == 1).mean() > 0.995 and background.cell_px == 4  # a few cells have two looks by chance
     for t, x in ((0, 20), (6, 70), (12, 120)):
         assert _iou(person(background, images[t], NOBODY), _ellipse(x)) > 0.95
     assert not np.asarray(person(background, _image(None, WALL, 99), NOBODY)).any()
@@ -69,15 +70,12 @@ def test_a_person_in_cloth_as_bright_as_the_wall_is_found_about_a_few_measured_p
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_who_lingers_is_not_the_background_if_it_is_told_where_she_is(told: bool) -> None:
+def test_who_lingers_is_not_the_background_whether_or_not_it_is_told_where_she_is(told: bool) -> None:
     at = [40.0] * 9 + [100.0] * 4
     images = [_image(x, 150 + PRINT, seed) for seed, x in enumerate(at)]
     background = _background(images, [_near(x) for x in at] if told else None)
     stands, gone = (person(background, images[t], _near(x) & _ellipse(x)) for t, x in ((0, 40), (12, 100)))
     ghost = np.asarray(gone)[_ellipse(40)].mean()
-    if not told:
-        assert ghost > 0.9  # what stays the same most of the time is the background
-        return
     assert ghost == 0 and _iou(gone, _ellipse(100)) > 0.95 and _iou(stands, _ellipse(40)) > 0.95
     assert np.abs(background.grey - WALL)[_ellipse(40)].mean() < NOISE
 
@@ -90,7 +88,7 @@ def test_where_somebody_was_always_near_the_background_is_doubtful_and_where_not
     background = _background(images, [near] * len(images))
     known = background.known
     assert (known[near] < 0.5).all() and (known[near] > 0).all() and (known[:20, :20] == 0).mean() > 0.9
-    assert (known[25:55, 25:95] == 1).all()
+    assert (known[25:55, 25:95] == 1).mean() > 0.99
     assert not np.asarray(person(background, images[6], NOBODY))[:18, :18].any()  # what differs from something unknown is not the person
 
 
@@ -104,6 +102,34 @@ def test_who_stood_there_all_the_time_and_was_not_always_measured_is_no_backgrou
     assert (_background(images, near).known[standing] == 1).any(), "or the test shows nothing"
     known = _background(images, near, seen).known
     assert (known[foot] == 0).mean() > 0.9 and (known[:55] == 1).all()
+
+
+@pytest.mark.parametrize("standing", [8, 5])
+def test_a_leg_that_stood_for_most_of_a_clip_is_the_person_and_what_it_uncovers_is_the_background(standing: int) -> None:
+    """Nothing was measured on it. With `standing` 5 of 13 the wall is the more frequent look."""
+    cloth = 150 + 0.2 * PRINT
+    images = [_image(40 if t < standing else None, cloth, t) for t in range(13)]
+    background = _background(images)
+    inside = cv2.erode(_ellipse(40).astype(np.uint8), np.ones((3, 3))) > 0
+    assert np.abs(background.grey - WALL)[inside].mean() < NOISE and (background.known[inside] == 1).mean() > 0.95
+    assert _iou(person(background, images[0], NOBODY), _ellipse(40)) > 0.95
+    assert not np.asarray(person(background, images[12], NOBODY)).any()
+
+
+def test_a_second_look_needs_to_be_clear() -> None:
+    """A cell alone in a flat wall: 12 images look like the wall, 4 otherwise; and two looks that the neighbours do not tell apart."""
+    wall, other, one = np.full((9, 9), 100.0), np.full((9, 9), 100.0), np.zeros((9, 9), dtype=int)
+    other[4, 4], one[4, 4] = 130.0, 4
+    first, second = look_cost(np.full((9, 9), 12), 0 * one), look_cost(one, 0 * one)
+    gain = second_is_background(wall, other, first, second, 1.0)
+    assert gain[4, 4] < -CLEAR and np.isneginf(np.delete(gain.ravel(), 40)).all()
+    swapped = np.where(one > 0, other, wall), np.where(one > 0, wall, other)
+    assert second_is_background(*swapped, first, second, 1.0)[4, 4] > CLEAR  # the less frequent look continues the wall
+    far = np.where(one > 0, 70.0, wall), other
+    assert abs(second_is_background(*far, first, look_cost(3 * one, 0 * one), 1.0)[4, 4]) < CLEAR  # neither does
+    measured = second_is_background(*far, look_cost(np.full((9, 9), 12), 4 * (one > 0)), look_cost(3 * one, 0 * one), 1.0)
+    assert measured[4, 4] > CLEAR  # the person was measured there whenever it looked so
+    assert np.isneginf(second_is_background(wall, other, first, look_cost(0 * one, 0 * one), 1.0)).all()
 
 
 def test_the_background_stays_known_behind_a_measured_walker_in_cloth_like_it() -> None:
