@@ -7,8 +7,9 @@ goes on beyond the outline of what stood before it, and measured points lie on t
 
 l is the look of each cell, g its grey value, σ the spread of the differences of neighbours in this view, m the number of images with that
 look, and n of those in which points of the person were measured there. Differences that are usual cost nothing (F): otherwise plain cloth
-would be a better background than a wall with texture. p is small: the cells of a leg are one event. Background estimation as a labelling of all pixels: Cohen (2005,
-Proc. ICCV, 1034–1041); E is minimised by min-sum belief propagation (Felzenszwalb & Huttenlocher 2006, Int. J. Comput. Vis. 70:41–54).
+would be a better background than a wall with texture. p is small: the cells of a leg are one event. Background estimation as a labelling
+of all pixels: Cohen (2005, Proc. ICCV, 1034-1041); E is minimised by min-sum belief propagation (Felzenszwalb & Huttenlocher 2006, Int. J.
+Comput. Vis. 70:41-54).
 """
 
 from collections.abc import Sequence

@@ -10,15 +10,17 @@ followed to the others. All explanations compete:
 S is the number of voxels of all these frames that an explanation accounts for; S/τ also contains log odds for walking forwards, because
 people seldom walk backwards. Explanations whose joints agree within `SAME_M` in all of them are one. The best one is uncertain unless
 another frame's own search finds it best, too: the right one may be missing among them. If it does not, a third frame is searched. Each
-clicked joint halves that doubt. Where the best explanation is less probable than `fitting.least_start_probability`, a click is asked for:
-on the joint whose places in the explanations differ most. Clicked joints are observations in all steps, and a click that is missed makes
+clicked joint halves that doubt. A limb may also be elsewhere in the best explanation (`limb_places`): the start is in the frame that shows
+best where the limbs are, and is the less probable, the less certain each of them is there. Where it is less probable than
+`fitting.least_start_probability`, a click is asked for: on the most uncertain joint of the least certain limb, or on the joint whose places
+in the explanations differ most. Clicked joints are observations in all steps, and a click that is missed makes
 the start improbable.
 
 Where an arm lies on the body is hardly seen in one frame: an adjustment that begins at the truth moves a wrist by up to 33 cm.
 Wrists therefore have a larger sigma (`StartJoints.sigma_m`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +29,7 @@ from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
+from .limb_places import LimbPlaces, limb_places, limb_rivals
 from .pose_dictionary import known_poses
 from .refine import (
     LEAST_POINTS,
@@ -34,7 +37,6 @@ from .refine import (
     Explanation,
     carried,
     exchanged,
-    limb_rivals,
     missed_m,
     of_hypothesis,
     thinned_points,
@@ -48,9 +50,9 @@ LOOKED_AT = 24  # frames of which the easiest is searched, and of those around i
 OUTLINE = 3.0  # voxels, by ray of an outline
 AROUND_S = (0.06, 0.4)  # between two frames that are searched
 SEARCHED = 3  # frames, at most
-FOLLOWED = 3  # explanations of a frame that are followed to the other
+FOLLOWED = 2  # explanations of a frame that are followed to the other
 UNCONFIRMED = 0.1  # the probability that no explanation is right, unless both frames find the best one; each clicked joint halves it
-TRIED, DIFFERENT_M, AMONG = 6, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
+TRIED, DIFFERENT_M, AMONG = 5, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
 COMPLETED = 3  # of them, whose limbs are looked for
 SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
@@ -118,22 +120,28 @@ def find_start(
             best = judged(fit, _everywhere(fit, points_of, found, monitor.part(STAGE, 2 * i + 1, parts)), walk)
             if is_confirmed(best.followed[0], found, names):
                 break
-    at = chosen[0] if fit.clicked else best.followed[0].found.t
-    clicked = np.unique(fit.clicked[at].joint) if fit.clicked else np.zeros(0, dtype=np.intp)
-    doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(clicked)
+    last = monitor.part(STAGE, parts - 1, parts)
+    searched = [chosen[0]] if fit.clicked else [of_frame[0].t for of_frame in found]
+    clicked = {t: with_clicks(fit, thinned_points(points_of(t)), best.followed[0].at(t), last) for t in searched}
+    limbs = {t: limb_places(fit, points_of(t), one, last) for t, one in clicked.items()}
+    at = max(searched, key=lambda t: surely(limbs[t]))
+    joints = np.unique(fit.clicked[at].joint) if at in fit.clicked else np.zeros(0, dtype=np.intp)
+    doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(joints)
+    final, stature = with_lengths(fit, thinned_points(points_of(at)), clicked[at], last)
+    kept = (1 - doubt) * float(np.exp(-0.5 * (missed_m(fit, final) / MISSED_M) ** 2))
     explanations = [one.at(at) for one in best.followed]
-    thin, last = thinned_points(points_of(at)), monitor.part(STAGE, parts - 1, parts)
-    final, stature = with_lengths(fit, thin, with_clicks(fit, thin, explanations[0], last), last)
-    kept = (1 - doubt) * np.exp(-0.5 * (missed_m(fit, final) / MISSED_M) ** 2)
-    doubt = 1 - float(kept)
+    rivals = _named(explanations, kept * best.probability, names)
+    if 1 - kept >= UNLIKELY:
+        rivals[UNTRIED] = 1 - kept
     return StartJoints(
         frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
         stature=stature,
         model=fit.model.name,
-        probability=kept * float(best.probability[0]),
-        rivals=_named(explanations, kept * best.probability, names) | ({UNTRIED: doubt} if doubt >= UNLIKELY else {}),
-        ask=_decisive(explanations, np.maximum(best.probability, doubt), names, clicked),
+        probability=kept * float(best.probability[0]) * surely(limbs[at]),
+        rivals=_with_limbs(rivals, limbs[at], kept * float(best.probability[0])),
+        ask=_least_sure(limbs[at], max(1 - kept, 1 - float(best.probability[0])), {names[j] for j in joints.tolist()})
+        or _decisive(explanations, np.maximum(best.probability, 1 - kept), names, joints),
     )
 
 
@@ -284,8 +292,35 @@ def _difference(a: Explanation, b: Explanation, names: Sequence[str]) -> str:
         crossed = [float(np.linalg.norm(a.joints_m[i] - b.joints_m[j])) for i, j in ((left, right), (right, left))]
         if max(crossed) < min(off[left], off[right]):
             return "the left and the right leg"
-    part, _, side = names[int(np.argmax(off))].partition(".")
+    return _whereabouts(names[int(np.argmax(off))])
+
+
+def _whereabouts(joint: str) -> str:
+    """The question where the limb of a joint is."""
+    part, _, side = joint.partition(".")
     return f"where the {'left' if side == 'L' else 'right'} {'arm' if part in ('shoulder', 'elbow', 'wrist') else 'leg'} is"
+
+
+def surely(limbs: Sequence[LimbPlaces]) -> float:
+    """The probability that all limbs are where they were found."""
+    return float(np.prod([limb.certainty for limb in limbs]))
+
+
+def _with_limbs(rivals: Mapping[str, float], limbs: Sequence[LimbPlaces], probability: float) -> dict[str, float]:
+    """The rivals with other places of single limbs, of an explanation with this probability; the more probable ones of the same name."""
+    named = dict(rivals)
+    for limb in limbs:
+        name, elsewhere = _whereabouts(next(iter(limb.doubt))), probability * (1 - limb.certainty)
+        if elsewhere >= UNLIKELY:
+            named[name] = max(elsewhere, named.get(name, 0.0))
+    return named
+
+
+def _least_sure(limbs: Sequence[LimbPlaces], doubt: float, clicked: Set[str]) -> str | None:
+    """The joint to click of the least certain limb; None if something else is doubted more, or all its joints are clicked."""
+    least = min(limbs, key=lambda limb: limb.certainty)
+    joints = {joint: off for joint, off in least.doubt.items() if joint not in clicked and joint.partition(".")[0] in JUDGED}
+    return max(joints, key=lambda joint: joints[joint]) if joints and 1 - least.certainty > doubt else None
 
 
 def _decisive(explanations: Sequence[Explanation], probability: np.ndarray, names: Sequence[str], clicked: np.ndarray) -> str:

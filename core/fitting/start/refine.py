@@ -7,11 +7,9 @@ import numpy as np
 
 from ...foundation.progress import Monitor
 from ..context import FitContext
-from ..explained import limb_gains
 from ..inputs.clicks import Clicks
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
-from ..limb import whole_limbs
 from ..observations import Keypoints, Observation
 from ..segmentation import SegmentationCache, crop
 from ..solve.problem import Estimate
@@ -25,9 +23,6 @@ REACH_M = 0.25  # of the points that take part, from the body
 ROUNDS = ((2.5, 6), (1.5, 6))  # gate_scale, steps
 FOLLOWING, STRIDE = ((1.5, 4),), 2  # the same where an explanation is followed through frames, and how many frames at a time
 LENGTH_STEPS = 8
-ANYWHERE, IMPROVED, AROUND, AROUND_RAD = 400, 6, 24, float(np.radians(15.0))  # poses of a limb: all around, the best, and around each
-COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights of what they explain
-ELSEWHERE_M, ALMOST = 0.2, 80.0  # between the ends of a limb and of its rival, and how many voxels less the rival may explain
 LEAST_POINTS, MOST_POINTS = 100, 700  # of a frame
 LEFT_OUT = ("toe", "crown")  # of an exchange: they depend on where the person faces
 SIGMA_M = 0.03  # of the joints of a rival
@@ -106,26 +101,6 @@ def with_limbs(fit: FitContext, points: CloudPoints, found: Explanation, monitor
         other = adjusted(fit, points, explanation(fit, found.t, points, pose, found.vector), ROUNDS[-1:], monitor)
         best = max(best, other, key=lambda one: one.score)
     return best
-
-
-def limb_rivals(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> list[Explanation]:
-    """Rivals with one limb elsewhere, where it explains almost as much; adjusted in the same way."""
-    evidence, state, rivals = fit.seen(found.t, points), fit.parameters.state(found.pose, found.vector), list[Explanation]()
-    for limb in whole_limbs(fit.parameters):
-        monitor.check()
-        near, own = evidence.near(limb, state), found.pose[limb.columns]
-        anywhere = limb.poses(found.pose, limb.samples(own, ANYWHERE, np.pi))
-        coarse = limb_gains(near.thinned(), limb, anywhere, found.vector, COARSE_M)
-        best = anywhere[np.argsort(-coarse, kind="stable")[:IMPROVED]]
-        around = [limb.poses(found.pose, limb.samples(pose[limb.columns], AROUND, AROUND_RAD)) for pose in best]
-        tried = np.concatenate([found.pose[None], best, *around])
-        gain, ends = limb_gains(near, limb, tried, found.vector, FINE_M), limb.ends(tried, found.vector)
-        elsewhere = np.linalg.norm(ends - ends[0], axis=2).max(axis=1) > ELSEWHERE_M
-        other = int(np.argmax(np.where(elsewhere, gain, -np.inf)))
-        if elsewhere[other] and gain[other] > gain[0] - ALMOST:
-            start = explanation(fit, found.t, points, tried[other], found.vector)
-            rivals.append(adjusted(fit, points, start, ROUNDS[-1:], monitor))
-    return rivals
 
 
 def exchanged(fit: FitContext, points: CloudPoints, found: Explanation, parts: Sequence[str], monitor: Monitor) -> Explanation:

@@ -16,9 +16,10 @@ from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages import set_up
 from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_start, with_start
 from tricap.core.fitting.start import find, search
-from tricap.core.fitting.start.find import Followed, _decisive, _difference, is_confirmed, judged
+from tricap.core.fitting.start.find import Followed, _decisive, _difference, _least_sure, _with_limbs, is_confirmed, judged, surely
+from tricap.core.fitting.start.limb_places import LimbPlaces, limb_places
 from tricap.core.fitting.start.pose_dictionary import known_poses
-from tricap.core.fitting.start.refine import Explanation, missed_m
+from tricap.core.fitting.start.refine import Explanation, explanation, missed_m
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run.joints import write_joints_as_clicks
@@ -42,9 +43,9 @@ def _pose(heading_deg: float) -> np.ndarray:
     return pose
 
 
-def _input(pose: np.ndarray, **changes) -> FitInput:
+def _input(pose: np.ndarray, points: int = 900, **changes) -> FitInput:
     rng = np.random.default_rng(0)
-    cloud = measured_cloud(SHAPE, pose, 0, rng, points=900, noise=0.002, gross=0.01)
+    cloud = measured_cloud(SHAPE, pose, 0, rng, points=points, noise=0.002, gross=0.01)
     return FitInput(**{"rig": front_rig(), "model": "full", "clouds": [cloud], "time_s": np.zeros(1), **changes})
 
 
@@ -81,6 +82,38 @@ def test_a_person_is_found_from_points_alone(quick) -> None:
     assert (
         0 < found.probability <= 1 - find.UNCONFIRMED < SETTINGS.least_start_probability and find.UNTRIED in found.rivals
     )  # a single frame
+
+
+def _limbs(given: FitInput, pose: np.ndarray, monkeypatch) -> dict[str, LimbPlaces]:
+    """Where the limbs of a pose may be in a frame, by the first of their joints."""
+    used = {}
+    monkeypatch.setattr(set_up, "find_start", lambda fit, points_of, *_: used.update(fit=fit, points=points_of(0)))
+    find_joints(given, SETTINGS, Monitor())
+    fit, points = used["fit"], used["points"]
+    found = explanation(fit, 0, points, pose, fit.parameters.vector())
+    return {next(iter(limb.doubt)): limb for limb in limb_places(fit, points, found, Monitor())}
+
+
+def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicked(monkeypatch) -> None:
+    pose = _pose(0.0)
+    given = _input(pose, points=6000)
+    seen = _limbs(given, pose, monkeypatch)
+    assert set(seen) == {"elbow.R", "elbow.L", "knee.R", "knee.L"} and all(0 <= limb.certainty <= 1 for limb in seen.values())
+    joints, cloud = dict(zip(NAMES, _joints(pose))), given.clouds[0]
+    a, b = joints["shoulder.R"], joints["wrist.R"] + 0.5 * (joints["wrist.R"] - joints["elbow.R"])
+    X, elbow = cloud.xyz_m, joints["elbow.R"]
+    along = [p + f * (q - p) for p, q in ((a, elbow), (elbow, b)) for f in np.linspace(0.2, 1, 9)]
+    near = np.min([np.linalg.norm(X - place, axis=1) for place in along], axis=0)
+    kept = {key: value if key == "frame" else value[near > 0.1] for key, value in vars(cloud).items()}
+    bare = replace(given, clouds=[SimpleNamespace(**kept)])
+    lost = _limbs(bare, pose, monkeypatch)
+    assert lost["elbow.R"].certainty < 0.3 and seen["elbow.R"].certainty > 0.6, (lost["elbow.R"].certainty, seen["elbow.R"].certainty)
+    assert surely(list(lost.values())) <= lost["elbow.R"].certainty
+    assert _least_sure(list(lost.values()), 0.1, set()) in ("elbow.R", "wrist.R")
+    assert _least_sure(list(lost.values()), 0.1, {"elbow.R", "wrist.R"}) is None and _least_sure(list(lost.values()), 1.0, set()) is None
+    assert _with_limbs({"where the right arm is": 0.01}, list(lost.values()), 0.8)["where the right arm is"] > 0.4
+    clicks = {0: {"wrist.R": {c.name: c.project(joints["wrist.R"]) for c in front_rig().cameras}}}
+    assert _limbs(replace(bare, clicks=clicks), pose, monkeypatch)["elbow.R"].certainty > 0.9
 
 
 def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
