@@ -1,10 +1,12 @@
 """Self-calibrating bundle adjustment of a reference bar (Maas 1998; D'Apuzzo et al. 2000, §2.2) or a board, by Schur's complement.
 
-    x_ick + v = F_c(X_ik) ,   Σ w v² + Σ ((p − p0) / σ_p)² s² → min            (1)   6 + up to 10 unknowns per camera; X_ik: `network`
+    x_ick + v = F_c(X_ik) ,   Σ w v² + Σ ((p − p0) / σ_p)² s² → min            (1)   6 + up to 11 unknowns per camera; X_ik: `network`
     [V  W ] [Δc]   [g_c]
     [Wᵀ U ] [Δb] = [g_b] ,   U_i = L_i L_iᵀ ,   Y_i = L_i⁻¹ W_iᵀ                (2)   U: q×q blocks, q unknowns of a position
     S = V − Σ Y_iᵀ Y_i ,   S Δc = g_c − Σ Y_iᵀ L_i⁻¹ g_i                       (3)
     (S + μ G Gᵀ) Δc = …                                                        (4)   G: turning and shifting the whole (free network)
+
+The eleventh is how late the camera is, on which its image points x_ick then depend (`delays`).
 
 The second sum of (1) is the prior of the interior unknowns, as pseudo-observations (`reference_bar.lens_prior`); s is the sigma of the
 image points. The scale comes from the object, so G has six columns. All normal equations are float64; one step costs O(N C² + N C K).
@@ -19,6 +21,7 @@ import numpy as np
 
 from ..geometry.camera import INTERIOR, columns_of_derivatives, columns_of_exterior, image_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
+from .delays import MovingPoints
 from .network import Network
 
 AnyNetwork = TypeVar("AnyNetwork", bound=Network)
@@ -29,21 +32,36 @@ NEAREST_M = 1e-3  # in front of the camera; points that are nearer count as behi
 DAMPING = 1e-3  # of the first step, relative to the diagonal of the normal matrix
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e6  # no step lowers the sum of squares any more
+DELAY = 16  # index of the delay among the unknowns of a camera
+DELAY_SIGMA = 1.0  # images, of all cameras but the first
+FIRST_DELAY_SIGMA = 1e-6
 CONVERGED = 1e-4  # decrease of the sum of squares in units of σ0² per unknown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Unknowns:
-    """Which interior unknowns are free in all cameras, and their prior."""
+    """Which interior unknowns are free in all cameras, their prior, and whether the delays of the cameras are free."""
 
     free: np.ndarray  # (10,)
     expected: np.ndarray  # (C, 10)
     sigma: np.ndarray  # (C, 10) of the expected values
+    expected_delay_images: np.ndarray | None = None  # (C,); None: no delays
 
     @property
     def columns(self) -> np.ndarray:
-        """Indices of the free unknowns among the 16 of a camera, exterior orientation last."""
-        return np.concatenate([np.flatnonzero(self.free), np.arange(10, 16)])
+        """Indices of the free unknowns among the 17 of a camera: interior, delay, and the exterior orientation, indices 10 to 15, last."""
+        delay = np.arange(DELAY, DELAY + int(self.with_delays))
+        return np.concatenate([np.flatnonzero(self.free), delay, np.arange(10, 16)])
+
+    @property
+    def with_delays(self) -> bool:
+        """Whether the delays are free."""
+        return self.expected_delay_images is not None
+
+    @property
+    def in_step(self) -> "Unknowns":
+        """The same without delays."""
+        return replace(self, expected_delay_images=None)
 
     def only(self, *names: str) -> "Unknowns":
         """The same prior with only these unknowns free."""
@@ -92,6 +110,14 @@ def residuals(network: Network, xy_px: np.ndarray) -> np.ndarray:
         return np.clip(xy_px - image.transpose(2, 0, 1, 3), -BEHIND_PX, BEHIND_PX)
 
 
+def residuals_of(network: Network, points: np.ndarray | MovingPoints) -> tuple[np.ndarray, np.ndarray | None]:
+    """Observed − computed (N, C, K, 2), and the velocity of the observed points [px / image] where they are moving."""
+    if isinstance(points, MovingPoints):
+        xy_px, velocity = points.at(np.zeros(len(network.R)) if network.delay_images is None else network.delay_images)
+        return residuals(network, xy_px), velocity
+    return residuals(network, points), None
+
+
 def _in_cameras(network: Network) -> np.ndarray:
     """The object's points in each camera's frame (C, 3, K N): point 0 of all positions, then point 1 …"""
     return network.R @ network.columns_m.reshape(3, -1) + network.t[..., None]
@@ -99,6 +125,7 @@ def _in_cameras(network: Network) -> np.ndarray:
 
 def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarray) -> tuple[np.ndarray, float]:
     """Weights (N, C, K) of the image points and their part of the sum (1); Cauchy's weights if a width is given (Huber 1981)."""
+    used = used & np.isfinite(residual_px).all(axis=-1)
     square = np.where(used, np.sum(np.nan_to_num(residual_px) ** 2, axis=-1), 0.0)
     if cauchy_px is None:
         return used.astype(np.float64), float(square.sum())
@@ -106,20 +133,30 @@ def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarra
     return used / (1 + u), float(cauchy_px**2 * np.log1p(u).sum())
 
 
-def design(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def design(network: Network, unknowns: Unknowns, velocity_px: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Image points (C, 2, K, N) (x and y, points, positions) and their derivatives to the free camera unknowns (C, p, 2, K, N) and to
-    those of the position (C, q, 2, K, N)."""
+    those of the position (C, q, 2, K, N). `velocity_px` (N, C, K, 2) per image is that of the observed points, if delays are free."""
     p = _in_cameras(network)
     C, N = len(p), network.count
     p = np.where(p[:, 2:] > NEAREST_M, p, [[0.0], [0.0], [1e3]])
     image, J_interior, G = columns_of_derivatives(network.interior, p)
-    J = np.concatenate([J_interior[:, np.flatnonzero(unknowns.free)], columns_of_exterior(G, p)], axis=1)
+    J = [J_interior[:, np.flatnonzero(unknowns.free)], columns_of_exterior(G, p)]
+    if unknowns.with_delays:
+        moving = np.zeros(image.shape) if velocity_px is None else velocity_px.transpose(1, 3, 2, 0).reshape(image.shape)
+        J.insert(1, moving[:, None])
     K = p.shape[-1] // max(N, 1)
     GR = (network.R.transpose(0, 2, 1)[:, None] @ G).reshape(C, 2, 3, K, N).swapaxes(1, 2)
-    return image.reshape(C, 2, K, N), J.reshape(C, -1, 2, K, N), network.derivatives(GR)
+    return image.reshape(C, 2, K, N), np.concatenate(J, axis=1).reshape(C, -1, 2, K, N), network.derivatives(GR)
 
 
-def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns, unit_px: float) -> Normals:
+def normal_equations(
+    network: Network,
+    residual_px: np.ndarray,
+    weight: np.ndarray,
+    unknowns: Unknowns,
+    unit_px: float,
+    velocity_px: np.ndarray | None = None,
+) -> Normals:
     """The normal equations (2) with pseudo-observations; `unit_px` is the sigma s of an image coordinate."""
     from scipy.linalg import block_diag
 
@@ -127,7 +164,7 @@ def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarr
     V, g_c = np.zeros((C, p, p)), np.zeros((C, p))
     U, g_b, W = np.empty((q, q, N)), np.empty((q, N)), np.empty((q, C, p, N))
     for at, part in network.blocks():
-        J, B, v = _weighted(part, residual_px[at], weight[at], unknowns)
+        J, B, v = _weighted(part, residual_px[at], weight[at], unknowns, None if velocity_px is None else velocity_px[at])
         flat = J.reshape(C, p, -1)
         V += flat @ flat.swapaxes(1, 2)
         g_c += (flat @ v.reshape(C, -1, 1))[..., 0]
@@ -139,9 +176,11 @@ def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarr
     return normals
 
 
-def _weighted(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns) -> tuple[np.ndarray, ...]:
+def _weighted(
+    network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns, velocity_px: np.ndarray | None
+) -> tuple[np.ndarray, ...]:
     """Derivatives (C, p, 2 K, N), (C, q, 2 K, N) and residuals (C, 2 K, N), times the square roots of the weights."""
-    _, J, B = design(network, unknowns)
+    _, J, B = design(network, unknowns, velocity_px)
     root = np.sqrt(weight.transpose(1, 2, 0))[:, None]  # (C, 1, 2, N)
     v = np.where(weight[..., None] > 0, residual_px, 0.0).transpose(1, 3, 2, 0) * root
     J *= root[:, None]
@@ -151,29 +190,38 @@ def _weighted(network: Network, residual_px: np.ndarray, weight: np.ndarray, unk
 
 
 def _add_pseudo_observations(V: np.ndarray, g_c: np.ndarray, network: Network, unknowns: Unknowns, unit_px: float) -> None:
-    free = np.flatnonzero(unknowns.free)
-    p = len(free) + 6
-    for c in range(len(network.interior)):
-        at = c * p + np.arange(len(free))
-        P = (unit_px / unknowns.sigma[c, free]) ** 2
+    off, sigma = _pseudo_observations(network, unknowns)
+    p = len(unknowns.columns)
+    for c in range(len(off)):
+        at = c * p + np.arange(off.shape[1])
+        P = (unit_px / sigma[c]) ** 2
         V[at, at] += P
-        g_c[at] += P * (unknowns.expected[c, free] - network.interior[c, free])
+        g_c[at] += P * off[c]
+
+
+def _pseudo_observations(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Expected values less those of the network (C, p − 6), and their sigmas."""
+    off, sigma = (unknowns.expected - network.interior)[:, unknowns.free], unknowns.sigma[:, unknowns.free]
+    if unknowns.expected_delay_images is None or network.delay_images is None:
+        return off, sigma
+    late = np.full((len(off), 1), DELAY_SIGMA)
+    late[0] = FIRST_DELAY_SIGMA
+    return np.hstack([off, (unknowns.expected_delay_images - network.delay_images)[:, None]]), np.hstack([sigma, late])
 
 
 def pseudo_cost(network: Network, unknowns: Unknowns, unit_px: float) -> float:
     """The second sum of (1)."""
-    off = ((network.interior - unknowns.expected) / unknowns.sigma)[:, unknowns.free]
-    return float(unit_px**2 * np.sum(off**2))
+    off, sigma = _pseudo_observations(network, unknowns)
+    return float(unit_px**2 * np.sum((off / sigma) ** 2))
 
 
 def free_network(network: Network, unknowns: Unknowns) -> np.ndarray:
     """The changes (C p, 6) of the camera unknowns when the whole network is rotated and shifted, which leaves all images unchanged."""
-    free = int(unknowns.free.sum())
-    C = len(network.R)
-    G = np.zeros((C, free + 6, 6))
-    G[:, free : free + 3, :3] = G[:, free + 3 :, 3:] = -network.R
-    G[:, free + 3 :, :3] = -cross_matrix(network.t) @ network.R
-    return G.reshape(C * (free + 6), 6)
+    C, p = len(network.R), len(unknowns.columns)
+    G = np.zeros((C, p, 6))
+    G[:, -6:-3, :3] = G[:, -3:, 3:] = -network.R
+    G[:, -3:, :3] = -cross_matrix(network.t) @ network.R
+    return G.reshape(C * p, 6)
 
 
 def reduce_to_cameras(normals: Normals, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -233,15 +281,17 @@ def moved(network: AnyNetwork, unknowns: Unknowns, step: np.ndarray, positions: 
     C = len(network.R)
     step = step.reshape(C, -1)
     interior = network.interior.copy()
-    interior[:, unknowns.free] += step[:, :-6]
+    free = int(unknowns.free.sum())
+    interior[:, unknowns.free] += step[:, :free]
+    delay = network.delay_images if network.delay_images is None or not unknowns.with_delays else network.delay_images + step[:, free]
     turn = rotation_from_vector(step[:, -6:-3])
     R, t = turn @ network.R, (turn @ network.t[..., None])[..., 0] + step[:, -3:]
-    return replace(network.stepped(positions), interior=interior, R=R, t=t)
+    return replace(network.stepped(positions), interior=interior, R=R, t=t, delay_images=delay)
 
 
 def adjust(
     network: AnyNetwork,
-    xy_px: np.ndarray,
+    points: np.ndarray | MovingPoints,
     used: np.ndarray,
     unknowns: Unknowns,
     *,
@@ -249,17 +299,17 @@ def adjust(
     unit_px: float = 0.1,
     iteration: LevenbergMarquardt = LevenbergMarquardt(),  # noqa: B008  frozen
 ) -> Adjusted[AnyNetwork]:
-    """Minimise (1) by Levenberg–Marquardt from `network`, with the image points `used` (N, C, K)."""
+    """Minimise (1) by Levenberg–Marquardt from `network`, with the image points `used` (N, C, K) of (N, C, K, 2), which may be moving."""
     iterations, converged, damping = 0, False, iteration.damping
-    v = residuals(network, xy_px)
+    v, velocity = residuals_of(network, points)
     weight, cost = weights_of(v, cauchy_px, used)
     cost += pseudo_cost(network, unknowns, unit_px)
     while iterations < iteration.max_iterations and not converged and damping < MAX_DAMPING:
         iterations += 1
-        normals = normal_equations(network, v, weight, unknowns, unit_px)
+        normals = normal_equations(network, v, weight, unknowns, unit_px, velocity)
         while damping < MAX_DAMPING:
             trial = moved(network, unknowns, *solve_step(network, normals, unknowns, damping))
-            v_trial = residuals(trial, xy_px)
+            v_trial, velocity_trial = residuals_of(trial, points)
             weight_trial, cost_trial = weights_of(v_trial, cauchy_px, used)
             cost_trial += pseudo_cost(trial, unknowns, unit_px) if _possible(trial) else np.inf
             if cost_trial <= cost:
@@ -268,7 +318,7 @@ def adjust(
         else:
             break
         converged = cost - cost_trial < iteration.tolerance * unit_px**2 * len(normals.g_c)
-        network, v, weight, cost = trial, v_trial, weight_trial, cost_trial
+        network, v, velocity, weight, cost = trial, v_trial, velocity_trial, weight_trial, cost_trial
         damping = max(damping / 10, MIN_DAMPING)
     return Adjusted(network=network, residual_px=v, weight=weight, cost=cost, iterations=iterations, converged=converged)
 

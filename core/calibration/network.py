@@ -74,6 +74,9 @@ class Observations(Protocol):
     def part(self, positions: np.ndarray | Sequence[int]) -> Self:
         """Some of the positions: indices or a mask (N,)."""
 
+    def changed(self, xy_px: np.ndarray) -> Self:
+        """The same cameras and object with other image points."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Network:
@@ -82,6 +85,7 @@ class Network:
     interior: np.ndarray  # (C, 10), see INTERIOR
     R: np.ndarray  # (C, 3, 3) world → camera
     t: np.ndarray  # (C, 3) m
+    delay_images: np.ndarray | None = None  # (C,) by which each camera is later than the first; None: all at once
 
     unknowns: ClassVar[int]  # q, of a position
 

@@ -196,7 +196,7 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
             calibration.network.at(~out),
             observations.part(~out).xy_px,
             calibration.used[~out],
-            calibration.unknowns,
+            calibration.unknowns.in_step,
             unit_px=calibration.sigma0_px,
             iteration=LevenbergMarquardt(max_iterations=6, tolerance=1e-2),
         )
@@ -228,9 +228,11 @@ def mirrored(calibration: Calibration) -> float:
     H = np.eye(3) - 2 * np.outer(view, view)
     R = np.diag([1.0, 1.0, -1.0]) @ network.R @ H
     start = replace(network.transformed(H, middle - H @ middle), R=R, t=network.R @ middle + network.t - R @ middle)
-    unknowns, sigma = calibration.unknowns.only("f"), calibration.sigma0_px
-    other = adjust(start, part.xy_px, used, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0))
-    this = adjust(network, part.xy_px, used, calibration.unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=2))
+    unknowns, sigma = calibration.unknowns.in_step, calibration.sigma0_px
+    other = adjust(
+        start, part.xy_px, used, unknowns.only("f"), unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0)
+    )
+    this = adjust(network, part.xy_px, used, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=2))
     return other.cost / max(this.cost, 1e-12)
 
 

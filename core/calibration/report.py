@@ -49,6 +49,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "volume_visited": quality.visited,
         "volume_seen_by_two": quality.seen_by_two,
         "bars_rejected": quality.rejected,
+        "delays_images": {name: {"value": value, "sigma": sigma} for name, (value, sigma) in calibration.delays.items()},
         "decisions": list(calibration.decisions),
         "remarks": list(calibration.remarks),
         "correlations": [list(entry) for entry in quality.correlations],
@@ -133,12 +134,19 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
         f"the {observations.noun} reached {100 * quality.visited:.0f} % of it.",
         f"Scatter of the {observations.noun}'s directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
         f"a mirrored rig fits {quality.mirror:.3g} times worse.",
+        *(_delay_line(calibration.observations.names[0], name, *delay) for name, delay in calibration.delays.items()),
         *(f"{line[0].upper()}{line[1:]}." for line in (*calibration.decisions, *calibration.remarks)),
         "",
         *(line for c in range(len(observations.names)) for line in _camera_lines(calibration, quality, c)),
         *(f"Camera {name}: {a} and {b} are correlated by {rho:+.3f}." for name, a, b, rho in quality.correlations),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _delay_line(first: str, name: str, value: float, sigma: float) -> str:
+    when = "later" if value > 0 else "earlier"
+    interval = f"{abs(value):.4f} ± {sigma:.4f} of their interval"
+    return f"Camera {name} took its images {interval} {when} than camera {first}; the adjustment allows for it."
 
 
 def _length_line(label: str, lengths: Lengths) -> str:

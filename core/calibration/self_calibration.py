@@ -1,8 +1,10 @@
 """Self-calibration from image points of a waved bar: start, robust adjustment, outliers, selection of lens parameters, precision.
 
+0  how late each camera is, roughly, if the images fit one another better then (`delays`);
 1  initial values from nothing (`reference_bar`), on a part of the positions;
 2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly, on that part;
 3  all positions: order of the ends, intersection, robust adjustment;
+   the delays of the cameras are unknowns from here on if they are significant, by the test (3), and LEAST_DELAY or more;
 4  least squares; data snooping (Baarda 1968): the worst image point of each bar is removed until no test exceeds its limit,
    w = v / (σ0 √q_vv) ,   q_vv = 1 − a Q_c aᵀ − b U⁻¹ bᵀ ,   a = j − b U⁻¹ Wᵀ                                                 (1)
    j, b: rows of the design matrix;   Σ q_vv = number of observations − number of unknowns = redundancy                         (2)
@@ -20,7 +22,20 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR
 from ..geometry.robust import mad_sigma
 from .bars import BarObservations, labelled_ends, with_bars
-from .bundle import Adjusted, AnyNetwork, LevenbergMarquardt, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
+from .bundle import (
+    DELAY,
+    Adjusted,
+    AnyNetwork,
+    LevenbergMarquardt,
+    Unknowns,
+    adjust,
+    design,
+    eliminated,
+    inverse_factors,
+    normal_equations,
+    residuals_of,
+)
+from .delays import MovingPoints, first_delays, in_order, moving_points, without_jumps
 from .network import BarNetwork, Network, Observations
 from .precision import camera_covariance, group_of, with_left_out
 from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_prior
@@ -32,8 +47,11 @@ SMALLEST_Q = 0.02  # of q_vv in (1)
 PART = 400  # positions of the refined start
 GROSS = 6.5  # sigmas of an image point that does not fit the intersection
 ROUNDS = 15  # of data snooping
+DELAY_ROUNDS = 3  # of the first adjustment with delays
 RETRIED_ROUNDS = 2  # in which all image points are tested again
 MIN_SIGMA_PX = 0.004
+DELAY_SIGNIFICANCE = 1e-3
+LEAST_DELAY = 0.01  # images: cameras that are less apart count as in step
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -55,9 +73,19 @@ class Calibration:
     doubt: str = ""  # why the cameras may be wrong although the figures are good
 
     @property
+    def delays(self) -> dict[str, tuple[float, float]]:
+        """By how many images each camera is later than the first, and its sigma; nothing where all are in step."""
+        if self.network.delay_images is None:
+            return {}
+        columns = list(self.unknowns.columns)
+        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))[columns.index(DELAY) :: len(columns)]
+        names = self.observations.names
+        return {name: (float(d), float(s)) for name, d, s in list(zip(names, self.network.delay_images, sigma))[1:]}
+
+    @property
     def every_unknown(self) -> Unknowns:
         """All sixteen unknowns of a camera, to which `considered` belongs."""
-        return replace(self.unknowns, free=np.ones(len(INTERIOR), dtype=bool))
+        return replace(self.unknowns.in_step, free=np.ones(len(INTERIOR), dtype=bool))
 
 
 def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
@@ -67,6 +95,11 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
         InputError: the cameras share too few bars.
     """
     monitor.step("calibration", 0, 5)
+    raw = without_jumps(observations.frames, observations.xy_px)
+    moving = moving_points(observations.frames, raw)
+    late = first_delays(moving, observations.size_px, observations.labelled)
+    if late.any():
+        observations = observations.changed(moving.at(late)[0], labelled=observations.labelled)
     start = initial_network(observations, focal_px)
     monitor.step("calibration", 1, 5)
     network, labelled, sigma = refined_start(start.network, observations)
@@ -75,8 +108,52 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     monitor.step("calibration", 3, 5)
-    tested = without_outliers(first, labelled, used, prior, lambda bars, tolerance_px: with_bars(bars, labelled, tolerance_px))
-    return without_insignificant(*tested, labelled, monitor)
+    ordered = in_order(raw, observations.xy_px, labelled.xy_px, late)
+    points = moving_points(labelled.frames, without_jumps(labelled.frames, ordered), late)
+
+    def again(bars: BarNetwork, tolerance_px: float) -> tuple[BarNetwork, np.ndarray]:
+        return with_bars(bars, labelled if bars.delay_images is None else labelled.changed(points.at(bars.delay_images)[0]), tolerance_px)
+
+    delayed = with_delays(first, points, prior, sigma, again)
+    if delayed is None:
+        tested = without_outliers(first, labelled, used, prior, again)
+        return without_insignificant(*tested, labelled, monitor)
+    first, used = delayed
+    tested = without_outliers(first, labelled, used, _with_delays(prior, points), again, points)
+    return without_insignificant(*tested, labelled, monitor, points)
+
+
+def with_delays(
+    first: Adjusted[AnyNetwork],
+    points: MovingPoints,
+    prior: Unknowns,
+    sigma_px: float,
+    again: Callable[[AnyNetwork, float], tuple[AnyNetwork, np.ndarray]],
+) -> tuple[Adjusted[AnyNetwork], np.ndarray] | None:
+    """A robust adjustment with the delays of the cameras as unknowns, and the image points used; None if they are not significant.
+
+    `again` is that of `without_outliers`.
+    """
+    unknowns = _with_delays(prior, points)
+    network = replace(first.network, delay_images=points.expected_images.copy())
+    state, sigma = first, sigma_px
+    keep, late = np.zeros(0, dtype=bool), np.zeros(0)
+    for _ in range(DELAY_ROUNDS):
+        network, keep = again(network, max(10 * sigma, 1.0))
+        iteration = LevenbergMarquardt(max_iterations=8, tolerance=0.05)
+        state = adjust(network, points, keep, unknowns, cauchy_px=3 * sigma, unit_px=sigma, iteration=iteration)
+        network, sigma = state.network, robust_sigma(state.residual_px, keep & np.isfinite(state.residual_px).all(axis=-1))
+        late = np.zeros(0) if network.delay_images is None else network.delay_images[1:]
+        if np.abs(late).max(initial=0.0) < LEAST_DELAY:
+            return None
+    columns, C = list(unknowns.columns), len(network.R)
+    at = np.arange(1, C) * len(columns) + columns.index(DELAY)
+    covariance = _covariance(state, keep, unknowns, sigma, points)[np.ix_(at, at)]
+    return (state, keep) if _probability(late, covariance, float(keep.sum())) < DELAY_SIGNIFICANCE else None
+
+
+def _with_delays(unknowns: Unknowns, points: MovingPoints | None) -> Unknowns:
+    return unknowns if points is None else replace(unknowns, expected_delay_images=points.expected_images)
 
 
 def coarse_adjustment(network: AnyNetwork, xy_px: np.ndarray, used: np.ndarray, prior: Unknowns, sigma_px: float) -> Adjusted[AnyNetwork]:
@@ -116,15 +193,18 @@ def robust_sigma(residual_px: np.ndarray, used: np.ndarray) -> float:
     return max(MIN_SIGMA_PX, float(mad_sigma(residual_px[used]))) if used.any() else 1.0
 
 
-def redundant_parts(network: Network, used: np.ndarray, unknowns: Unknowns, unit_px: float) -> np.ndarray:
+def redundant_parts(
+    network: Network, used: np.ndarray, unknowns: Unknowns, unit_px: float, points: MovingPoints | None = None
+) -> np.ndarray:
     """q_vv (N, C, K, 2) of all image coordinates of weight 1; 1 for those that are not used.  (1), (2)"""
     zero = np.zeros((*used.shape, 2))
-    normals = normal_equations(network, zero, used.astype(np.float64), unknowns, unit_px)
+    velocity = None if points is None else residuals_of(network, points)[1]
+    normals = normal_equations(network, zero, used.astype(np.float64), unknowns, unit_px, velocity)
     root = _root(camera_covariance(network, normals, unknowns)).T
     N, C, K = used.shape
     parts = np.ones((C, 2 * K, N))
     for at, block in network.blocks():
-        _, J, B = design(block, unknowns)
+        _, J, B = design(block, unknowns, None if velocity is None else velocity[at])
         rows = J.reshape(C, -1, J[0, 0].size)  # (C, p, 2 K n)
         inverse = inverse_factors(normals.U[..., at])
         by_cameras = root @ eliminated(inverse, normals.W[..., at])  # (q, C p, n)
@@ -146,8 +226,11 @@ def without_outliers(
     used: np.ndarray,
     unknowns: Unknowns,
     again: Callable[[AnyNetwork, float], tuple[AnyNetwork, np.ndarray]],
+    points: MovingPoints | None = None,
 ) -> tuple[Adjusted[AnyNetwork], np.ndarray, float, float]:
     """Least squares with data snooping: the adjustment, the image points used, sigma0 and the redundancy.  (1)
+
+    `points` are those of cameras with delays.
 
     `again` measures the positions with the cameras of a network, and selects the image points that fit within a tolerance [px].
     """
@@ -157,10 +240,10 @@ def without_outliers(
         network = state.network
         if number < RETRIED_ROUNDS:  # image points that did not fit the cameras of the start are used again
             network, keep = again(network, GROSS * sigma)
-        state = adjust(
-            network, observations.xy_px, keep, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
-        )
-        parts = redundant_parts(state.network, keep, unknowns, sigma)
+        iteration = LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
+        state = adjust(network, points or observations.xy_px, keep, unknowns, unit_px=sigma, iteration=iteration)
+        keep = keep & np.isfinite(state.residual_px).all(axis=-1)
+        parts = redundant_parts(state.network, keep, unknowns, sigma, points)
         square = np.sum(np.where(keep[..., None], state.residual_px, 0.0) ** 2)
         redundancy = max(1.0, float(parts[keep].sum()))
         sigma = max(float(np.sqrt(square / redundancy)), 1e-6)
@@ -179,13 +262,20 @@ def _tested(residual_px: np.ndarray, parts: np.ndarray, sigma: float) -> np.ndar
 
 
 def without_insignificant(
-    state: Adjusted[AnyNetwork], keep: np.ndarray, sigma: float, redundancy: float, observations: Observations, monitor: Monitor
+    state: Adjusted[AnyNetwork],
+    keep: np.ndarray,
+    sigma: float,
+    redundancy: float,
+    observations: Observations,
+    monitor: Monitor,
+    points: MovingPoints | None = None,
 ) -> Calibration:
     """Leave out the groups of lens parameters that are not significant, with a new adjustment after each.  (3)"""
-    unknowns = lens_prior(observations.size_px, state.network.interior[:, 0])
+    unknowns = _with_delays(lens_prior(observations.size_px, state.network.interior[:, 0]), points)
     decisions: list[str] = []
     first, all_free = state.network, unknowns
-    full = covariance = _covariance(state, keep, unknowns, sigma)
+    covariance = _covariance(state, keep, unknowns, sigma, points)
+    full = _in_step(covariance, unknowns)
     tested_groups = list(GROUPS)
     while tested_groups:
         tests = [(wald(state.network, unknowns, covariance, group, redundancy), group) for group in tested_groups]
@@ -197,17 +287,17 @@ def without_insignificant(
         unknowns = replace(unknowns, free=unknowns.free & ~np.isin(INTERIOR, group))
         interior = np.where(unknowns.free, state.network.interior, unknowns.expected)
         fixed = replace(state.network, interior=interior)
-        state = adjust(
-            fixed, observations.xy_px, keep, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
-        )
-        covariance = _covariance(state, keep, unknowns, sigma)
+        iteration = LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
+        state = adjust(fixed, points or observations.xy_px, keep, unknowns, unit_px=sigma, iteration=iteration)
+        covariance = _covariance(state, keep, unknowns, sigma, points)
     monitor.step("calibration", 5, 5)
     square = float(np.sum(state.residual_px[keep] ** 2))
     sigma = float(np.sqrt(square / redundancy))
-    covariance = _covariance(state, keep, unknowns, sigma)
+    covariance = _covariance(state, keep, unknowns, sigma, points)
     left_out = tuple(group for group in GROUPS if group not in tested_groups)
+    late = state.network.delay_images
     return Calibration(
-        observations=observations,
+        observations=observations if points is None or late is None else observations.changed(points.at(late)[0]),
         network=state.network,
         used=keep,
         residual_px=state.residual_px,
@@ -215,20 +305,34 @@ def without_insignificant(
         sigma0_px=sigma,
         redundancy=redundancy,
         covariance=covariance,
-        considered=with_left_out(covariance, unknowns, full, first.interior - all_free.expected, left_out),
+        considered=with_left_out(_in_step(covariance, unknowns), unknowns.in_step, full, first.interior - all_free.expected, left_out),
         decisions=tuple(decisions),
         converged=state.converged,
     )
 
 
-def _covariance(state: Adjusted[AnyNetwork], keep: np.ndarray, unknowns: Unknowns, sigma: float) -> np.ndarray:
-    normals = normal_equations(state.network, state.residual_px, keep.astype(np.float64), unknowns, sigma)
+def _covariance(
+    state: Adjusted[AnyNetwork], keep: np.ndarray, unknowns: Unknowns, sigma: float, points: MovingPoints | None = None
+) -> np.ndarray:
+    velocity = None if points is None else residuals_of(state.network, points)[1]
+    normals = normal_equations(state.network, state.residual_px, keep.astype(np.float64), unknowns, sigma, velocity)
     return camera_covariance(state.network, normals, unknowns) * sigma**2
+
+
+def _in_step(covariance: np.ndarray, unknowns: Unknowns) -> np.ndarray:
+    """The part of a covariance (C p, C p) that does not belong to delays."""
+    others = np.flatnonzero(np.tile(unknowns.columns != DELAY, len(covariance) // len(unknowns.columns)))
+    return covariance[np.ix_(others, others)]
 
 
 def wald(network: Network, unknowns: Unknowns, covariance: np.ndarray, group: tuple[str, ...], redundancy: float) -> float:
     """Probability of values as large as those of a group in all cameras if their true values were the expected ones.  (3)"""
+    x, Q = group_of(network.interior - unknowns.expected, unknowns, covariance, group)[:2]
+    return _probability(x, Q, redundancy)
+
+
+def _probability(x: np.ndarray, covariance: np.ndarray, redundancy: float) -> float:
+    """Probability of values as large as x (m,) if their true values were 0.  (3)"""
     from scipy.special import fdtrc
 
-    x, Q = group_of(network.interior - unknowns.expected, unknowns, covariance, group)[:2]
-    return float(fdtrc(len(x), redundancy, x @ np.linalg.solve(Q, x) / len(x)))
+    return float(fdtrc(len(x), redundancy, x @ np.linalg.solve(covariance, x) / len(x)))

@@ -105,10 +105,24 @@ def random_cameras(rng: np.random.Generator, kind: str) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def waved_bar(cameras: Sequence[Camera], positions: int, rng: np.random.Generator, noise: BarNoise, length_m: float = 0.5) -> WavedBar:
-    """Wave a bar through the volume and take its image points."""
-    ends = bar_ends(positions, rng, length_m)
-    xy = np.stack([c.project(ends) for c in cameras], axis=1)
+def waved_bar(
+    cameras: Sequence[Camera],
+    positions: int,
+    rng: np.random.Generator,
+    noise: BarNoise,
+    length_m: float = 0.5,
+    delay_images: Sequence[float] = (),
+    pace: float = 1.0,
+) -> WavedBar:
+    """Wave a bar through the volume and take its image points; camera c takes its images `delay_images[c]` later, if given."""
+    wave = rng.bit_generator.state
+    seen = []
+    for delay in delay_images or [0.0] * len(cameras):
+        rng.bit_generator.state = wave
+        seen.append(bar_ends(positions, rng, length_m, delay, pace))
+    rng.bit_generator.state = wave
+    ends = bar_ends(positions, rng, length_m, 0.0, pace)
+    xy = np.stack([c.project(at) for c, at in zip(cameras, seen)], axis=1)
     inside = np.stack([c.sees(xy[:, i]) for i, c in enumerate(cameras)], axis=1)
     wrong = rng.random(inside.shape) < noise.gross
     angle, far = rng.uniform(0, 2 * np.pi, inside.shape), rng.uniform(5, 200, inside.shape)
@@ -120,9 +134,9 @@ def waved_bar(cameras: Sequence[Camera], positions: int, rng: np.random.Generato
     return WavedBar(cameras=tuple(cameras), length_m=length_m, ends_m=ends, xy_px=xy, wrong=wrong, swapped=swapped)
 
 
-def bar_ends(positions: int, rng: np.random.Generator, length_m: float) -> np.ndarray:
+def bar_ends(positions: int, rng: np.random.Generator, length_m: float, delay_images: float = 0.0, pace: float = 1.0) -> np.ndarray:
     """Ends (N, 2, 3) of a bar on a Lissajous wave that fills the volume, turning through all directions."""
-    time = np.arange(positions)
+    time = pace * (np.arange(positions) + delay_images)
     rates = np.array([0.1831, 0.2827, 0.1319]) * rng.uniform(0.85, 1.15, 3)
     reach = (VOLUME_SIZE_M / 2) * 0.98 - length_m / 4
     centre = VOLUME_CENTRE_M + reach * np.sin(rates * time[:, None] + rng.uniform(0, 2 * np.pi, 3))

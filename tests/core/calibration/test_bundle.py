@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.calibration.bundle import (
+    DELAY,
     LevenbergMarquardt,
     Unknowns,
     adjust,
@@ -15,7 +16,9 @@ from tricap.core.calibration.bundle import (
     normal_equations,
     reduce_to_cameras,
     residuals,
+    residuals_of,
 )
+from tricap.core.calibration.delays import moving_points, without_jumps
 from tricap.core.calibration.self_calibration import redundant_parts
 from tricap.core.geometry.camera import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
@@ -115,3 +118,42 @@ def test_a_frozen_unknown_stays(waved) -> None:
     used = np.isfinite(waved.xy_px).all(-1)
     done = adjust(changed, waved.xy_px, used, unknowns, unit_px=0.1)
     assert (done.network.interior[:, 4] == changed.interior[:, 4]).all() and (done.network.interior[:, 0] != network.interior[:, 0]).all()
+
+
+def test_the_derivative_to_a_delay_agrees_with_differences(waved) -> None:
+    points = moving_points(np.arange(60), waved.xy_px)
+    late = np.array([0.0, 0.3, -1.2])
+    network = replace(true_network(waved), delay_images=late)
+    unknowns = replace(unknowns_of(network), expected_delay_images=late)
+    v, velocity = residuals_of(network, points)
+    J = design(network, unknowns, velocity)[1]
+    assert list(unknowns.columns).index(DELAY) == 10 and J.shape[1] == 17
+    step = np.zeros((3, 17))
+    step[:, 10] = 1e-5
+    ahead, back = (residuals_of(moved(network, unknowns, s * step.ravel(), np.zeros((5, 60))), points)[0] for s in (1, -1))
+    numeric = -(ahead - back) / 2e-5  # residuals are observed less computed
+    known = np.isfinite(numeric)
+    assert known[:, 1:].mean() > 0.4
+    assert np.allclose(J[:, 10].transpose(3, 0, 2, 1)[known], numeric[known], rtol=1e-6, atol=1e-4)
+
+
+def test_points_between_images_are_those_of_the_path() -> None:
+    at = np.arange(40)
+    path = np.stack([100 * np.sin(0.2 * at), 80 * np.cos(0.15 * at)], axis=-1).reshape(40, 1, 1, 2)
+    path = np.tile(path, (1, 2, 1, 1))
+    path[20] = np.nan
+    late = np.array([0.0, 2.4])
+    xy, velocity = moving_points(at, path).at(late)
+    known = np.isfinite(xy[:, 1, 0, 0])
+    t = at[known] - 2.4
+    assert np.allclose(xy[known, 1, 0], np.stack([100 * np.sin(0.2 * t), 80 * np.cos(0.15 * t)], axis=-1), atol=0.02)
+    assert np.allclose(velocity[known, 1, 0, 0], 20 * np.cos(0.2 * t), atol=0.1)
+    assert not known[22] and known[5:18].all() and np.array_equal(xy[:, 0], path[:, 0], equal_nan=True)
+
+
+def test_a_point_that_jumps_is_left_out_and_its_neighbours_are_kept() -> None:
+    at = np.arange(40)
+    path = np.tile((100 * np.sin(0.2 * at) + np.random.default_rng(0).normal(0, 0.05, 40))[:, None, None, None], (1, 2, 1, 2))
+    path[17, 1] += 6.0
+    left = np.isfinite(without_jumps(at, path)[..., 0, 0])
+    assert not left[17, 1] and left.sum() == 79

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tricap.core.calibration import report
 from tricap.core.calibration.bundle import Unknowns
 from tricap.core.calibration.calibrate import calibrate_rig
 from tricap.core.calibration.precision import predicted_error, with_left_out
@@ -203,3 +204,38 @@ def test_cameras_that_saw_different_things_are_refused() -> None:
     xy[:, 2] = xy[np.random.default_rng(0).permutation(100), 2]
     with pytest.raises(InputError, match="Camera R|camera R"):
         calibrate_rig(observed(waved).changed(xy), Monitor())
+
+
+def waved_out_of_step(seed: int, delay_images: tuple[float, ...], positions: int = 300) -> WavedBar:
+    noise = BarNoise(sigma_px=0.05)
+    return waved_bar(benchmark_cameras(), positions, np.random.default_rng(seed), noise, delay_images=delay_images, pace=0.5)
+
+
+@pytest.mark.parametrize("delay_images", [(0.0, 0.31, -0.46), (0.0, 4.2, -2.7)], ids=["parts of an image", "images"])
+def test_cameras_that_are_not_in_step_are_calibrated_as_well(delay_images: tuple[float, ...]) -> None:
+    together, apart = waved_out_of_step(3, (0.0, 0.0, 0.0)), waved_out_of_step(3, delay_images)
+    in_step, done = (calibrate_rig(observed(waved, labelled=False), Monitor()) for waved in (together, apart))
+    assert not in_step.calibration.delays
+    found = done.calibration.delays
+    assert list(found) == ["C", "R"]
+    for (value, sigma), true in zip(found.values(), delay_images[1:]):
+        assert abs(value - true) < 0.009  # 0.3 ms at 30 images/s
+        assert 1e-4 < sigma < 0.009
+    assert error_m(apart.cameras, done.rig.cameras) < max(1.3 * error_m(together.cameras, in_step.rig.cameras), 3e-4)
+    page = report.page(done.calibration, done.quality, done.verdict)
+    assert "Camera R took its images" in page and "than camera L; the adjustment allows for it." in page
+
+
+@pytest.mark.slow
+def test_delays_are_found_to_a_third_of_a_millisecond() -> None:
+    off, ratios = [], []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        delay = (0.0, *rng.uniform(-0.5, 0.5, 2))
+        apart, together = waved_out_of_step(seed, delay), waved_out_of_step(seed, (0.0, 0.0, 0.0))
+        done = calibrate(observed(apart), Monitor())
+        assert done.network.delay_images is not None
+        off.append((done.network.delay_images - delay) * 1e3 / 30)
+        cameras = done.network.cameras(done.observations.names, done.observations.size_px)
+        ratios.append(error_m(apart.cameras, cameras) / (ratio(together, 0.05) * bound(together, 0.05).rms_m))
+    assert np.sqrt(np.mean(np.square(off))) < 0.3 and np.median(ratios) < 1.2, (off, ratios)

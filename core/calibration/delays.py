@@ -1,0 +1,184 @@
+"""Cameras that are not in step: image points of a moving object at the instants of the frames, and how late each camera is.
+
+Camera c takes image n at the instant n + d_c, in images; camera 0 sets the clock, d_0 = 0. Its point at the instant n is interpolated:
+
+    x_c(n) = p(−d_c) ,   p(τ) = Σ a_m τᵐ through image n and those of n − 3 … n + 3 in which the point is known                  (1)
+    ∂v / ∂d_c = −p'(−d_c)                                                                                                       (2)
+
+The first d_c come from pairs of cameras, without knowing the cameras: the delay at which one fundamental matrix fits best.      (3)
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from ..foundation.arrays import frozen
+from .bars import sampson
+
+STEPS = np.arange(-3, 4)  # images of (1), as far as they are known
+FEWEST_STEPS = 4  # of them
+NEAR = 2  # images: the nearest on each side
+SEARCHED = np.arange(-8.0, 8.01, 0.5)  # images, of (3)
+REFINED = np.arange(-0.5, 0.51, 0.1)
+NEARBY = 0.2  # images: where neither this delay nor its opposite fits better than none, no other is tried
+CLEAR = 0.7  # of the distance without a delay: what fits less well is none
+WIDTH = 0.01  # of the image width: points further from their line count as that far
+SEARCH_POSITIONS = 200
+ITERATIONS = 500
+JUMP = 8.0  # times the median: further from the path through its neighbours, a point is wrong
+JUMP_ROUNDS = 4
+FEWEST_POINTS = 24  # of a pair of cameras
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MovingPoints:
+    """Image points of N positions, K points each, in C cameras, as functions of the cameras' delays.  (1)"""
+
+    frames: np.ndarray  # (N,)
+    coefficients: np.ndarray  # (7, N, C, K, 2), lowest first; NaN beyond the first where too few neighbours are known
+    expected_images: np.ndarray  # (C,) delays before the adjustment
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coefficients", frozen(self.coefficients, (len(STEPS), len(self.frames), None, None, 2)))
+        object.__setattr__(self, "expected_images", frozen(self.expected_images, self.coefficients.shape[2:3]))
+
+    def at(self, delay_images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image points (N, C, K, 2) at the instants of the frames, NaN where they are not known, and their velocity [px / image]."""
+        xy = np.empty(self.coefficients.shape[1:])
+        velocity = np.empty_like(xy)
+        for c, delay in enumerate(delay_images):
+            whole = int(np.rint(-delay))
+            a = self.coefficients[:, :, c]
+            if whole:
+                rows, known = self.rows(whole)
+                a = np.where(known[:, None, None], a[:, rows], np.nan)
+            tau = -float(delay) - whole
+            powers = tau ** np.arange(len(a))
+            xy[:, c] = a[0] if tau == 0 else np.tensordot(powers, a, axes=1)
+            velocity[:, c] = np.nan_to_num(np.tensordot(powers[:-1] * np.arange(1, len(a)), a[1:], axes=1))
+        return xy, velocity
+
+    def shifted(self, whole: int) -> np.ndarray:
+        """The image points (N, C, K, 2) that many images later."""
+        rows, known = self.rows(whole)
+        return np.where(known[:, None, None, None], self.coefficients[0, rows], np.nan)
+
+    def rows(self, whole: int) -> tuple[np.ndarray, np.ndarray]:
+        """The positions (N,) that many images later, and whether there is one."""
+        order = np.argsort(self.frames, kind="stable")
+        at = order[np.minimum(np.searchsorted(self.frames, self.frames + whole, sorter=order), len(order) - 1)]
+        return at, self.frames[at] == self.frames + whole
+
+
+def moving_points(frames: np.ndarray, xy_px: np.ndarray, expected_images: np.ndarray | None = None) -> MovingPoints:
+    """Points (N, C, K, 2) of frames (N,) with the polynomials through their neighbours in time.  (1)"""
+    still = _still(frames, xy_px, expected_images)
+    near = np.stack([still.shifted(int(s)) for s in STEPS], axis=-2)  # (N, C, K, 7, 2)
+    known = np.isfinite(near[..., 0])
+    fits = _interpolations()[known @ (1 << np.arange(len(STEPS)))]  # (N, C, K, 7, 7)
+    coefficients = np.moveaxis(fits @ np.nan_to_num(near), -2, 0)
+    coefficients[0] = xy_px
+    return MovingPoints(frames=frames, coefficients=coefficients, expected_images=still.expected_images)
+
+
+@lru_cache(maxsize=1)
+def _interpolations() -> np.ndarray:
+    """The coefficients of the polynomial from the points at STEPS (128, 7, 7), for each subset of them that is known; NaN: too few."""
+    fits = np.full((1 << len(STEPS), len(STEPS), len(STEPS)), np.nan)
+    for subset in range(len(fits)):
+        known = np.flatnonzero(subset >> np.arange(len(STEPS)) & 1)
+        steps = STEPS[known]
+        if 0 in steps and len(steps) >= FEWEST_STEPS and (-NEAR <= steps[steps < 0]).any() and (steps[steps > 0] <= NEAR).any():
+            fits[subset] = 0.0
+            fits[subset, : len(steps), known] = np.linalg.inv(np.vander(steps, increasing=True)).T
+    return fits
+
+
+def _still(frames: np.ndarray, xy_px: np.ndarray, expected_images: np.ndarray | None = None) -> MovingPoints:
+    coefficients = np.concatenate([xy_px[None], np.full((len(STEPS) - 1, *xy_px.shape), np.nan)])
+    expected = np.zeros(xy_px.shape[1]) if expected_images is None else expected_images
+    return MovingPoints(frames=frames, coefficients=coefficients, expected_images=expected)
+
+
+def without_jumps(frames: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
+    """The points (N, C, K, 2) without those that jump out of their path through the images before and after."""
+    xy = xy_px.copy()
+    for _ in range(JUMP_ROUNDS):
+        held = _still(frames, xy)
+        near = {s: held.shifted(s) for s in (-2, -1, 1, 2)}
+        off = np.linalg.norm(xy - (4 * (near[-1] + near[1]) - near[-2] - near[2]) / 6, axis=-1)
+        off = np.nan_to_num(off)
+        limit = JUMP * np.array([np.median(o[o > 0]) if (o > 0).any() else np.inf for o in np.moveaxis(off, 1, 0)])
+        rows = {s: held.rows(s) for s in near}
+        around = np.max([np.where(known[:, None, None], off[at], 0.0) for at, known in rows.values()], axis=0)
+        wrong = (off > limit[:, None]) & (off >= around)
+        if not wrong.any():
+            break
+        xy[wrong] = np.nan
+    return xy
+
+
+def first_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> np.ndarray:
+    """Delays (C,) of all cameras behind the first, from pairs of them; 0 where no delay clearly fits better.  (3)"""
+    C = len(size_px)
+    shown = np.isfinite(moving.coefficients[0, ..., 0]).any(axis=-1)
+    shared = shown.T.astype(int) @ shown
+    delay, placed = np.zeros(C), [0]
+    while len(placed) < C:
+        left = [c for c in range(C) if c not in placed]
+        i, j = max(((i, j) for i in placed for j in left), key=lambda pair: shared[pair])
+        delay[j] = delay[i] + _delay_between(moving, size_px, (i, j), labelled)
+        placed.append(j)
+    return delay
+
+
+def _delay_between(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], labelled: bool) -> float:
+    """By how many images the second camera is later than the first."""
+    at_once, earlier, later = (_distance(moving, size_px, pair, d, labelled) for d in (0.0, -NEARBY, NEARBY))
+    if at_once <= min(earlier, later):
+        return 0.0
+    coarse = min(SEARCHED, key=lambda d: _distance(moving, size_px, pair, d, labelled))
+    best = min(coarse + REFINED, key=lambda d: _distance(moving, size_px, pair, d, labelled))
+    return float(best) if _distance(moving, size_px, pair, best, labelled) < CLEAR * at_once else 0.0
+
+
+def _distance(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], delay: float, labelled: bool) -> float:
+    """Mean distance of the points of two cameras from their epipolar lines, in image widths, at a delay of the second."""
+    i, j = pair
+    delays = np.zeros(len(size_px))
+    delays[j] = delay
+    xy = moving.at(delays)[0]
+    some = np.flatnonzero(np.isfinite(xy[:, [i, j]]).all(axis=(1, 2, 3)))
+    some = some[np.unique(np.linspace(0, max(len(some) - 1, 0), SEARCH_POSITIONS).astype(int))] if len(some) else some
+    if len(some) * xy.shape[2] < FEWEST_POINTS:
+        return np.inf
+    ni, nj = ((xy[some, c] - size_px[c] / 2) / size_px[i, 0] for c in pair)
+    orders = (nj,) if labelled or xy.shape[2] != 2 else (nj, nj[:, ::-1])
+    return min(_of_one_matrix(ni.reshape(-1, 2), other.reshape(-1, 2)) for other in orders)
+
+
+def _of_one_matrix(ni: np.ndarray, nj: np.ndarray) -> float:
+    try:
+        F, _ = cv2.findFundamentalMat(np.ascontiguousarray(ni), np.ascontiguousarray(nj), cv2.USAC_MAGSAC, WIDTH / 2, 0.99, ITERATIONS)
+    except cv2.error:  # OpenCV 5.0 raises where no sample gives a matrix
+        F = None
+    return WIDTH if F is None or F.shape != (3, 3) else float(np.minimum(sampson(F, ni, nj), WIDTH).mean())
+
+
+def in_order(moving_px: np.ndarray, moved_px: np.ndarray, labelled_px: np.ndarray, delay_images: np.ndarray) -> np.ndarray:
+    """Raw image points (N, C, 2, 2) of a bar with its ends in the order that they have in `labelled_px`, at the instants of the frames.
+
+    `moved_px` are the raw points at these instants, in the order of the raw points.
+    """
+    xy, N = moving_px.copy(), len(moving_px)
+    swapped = np.nan_to_num(moved_px[:, :, 0]) != np.nan_to_num(labelled_px[:, :, 0])
+    for c, delay in enumerate(delay_images):
+        known = np.flatnonzero(np.isfinite(moved_px[:, c]).any(axis=(1, 2)))
+        if not len(known):
+            continue
+        nearest = known[np.clip(np.searchsorted(known, np.arange(N) + int(np.rint(delay))), 0, len(known) - 1)]
+        turn = swapped[nearest, c].any(axis=1)
+        xy[turn, c] = xy[turn, c, ::-1]
+    return xy
