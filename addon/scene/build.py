@@ -32,7 +32,7 @@ from .rest_pose import with_rest_pose
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
-SAME_RATE = 1e-3  # relative difference of the images per second that does not show
+MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
@@ -292,8 +292,11 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
         if clip.name.startswith(name := f"Footage {view.name}"):
             clip.name = name  # until now the clip of an earlier build had it
         clip.frame_start = _first_frame(footage, k)
-        if footage.clocks and abs(footage.interval_frames(k) / take.field_layout.per_image - 1) > SAME_RATE:
-            warnings.append(f"View {view.name} has its own images per second: Blender shows its footage at the rate of the take.")
+        if footage.clocks and (off := footage.strays_frames(k, clip.frame_start)) > MOST_STRAY * take.field_layout.per_image:
+            warnings.append(
+                f"View {view.name} has its own images per second or time stamps. Blender shows its footage at the rate of the take, up to "
+                f"{off:.0f} frames from its moment."
+            )
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
         if camera is reference:

@@ -15,6 +15,8 @@ from ..images.sequence import ImageSequence, open_sequence
 from .clock import Clock, clocks_of
 from .take import Clicks, Take
 
+STRAY_FRAMES = 200  # looked at
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Footage:
@@ -120,6 +122,15 @@ class Footage:
     def interval_frames(self, view: int) -> float:
         """The time between two images of a view, in frames of the take."""
         return self.clocks[view].period_s * self.take.fps if self.clocks else float(self.take.field_layout.per_image)
+
+    def strays_frames(self, view: int, first_frame: int) -> float:
+        """By how many frames a view is shown at another moment, at most, where its images are played one after another at the take's rate.
+
+        Its image 0 is then shown in the scene's `first_frame`.
+        """
+        per = self.take.field_layout.per_image
+        some = self.frames[:: max(1, len(self.frames) // STRAY_FRAMES)]
+        return max((abs(per * self.number(view, frame) + first_frame - frame) for frame in some), default=0.0)
 
     def files(self, frame: int) -> list[Path]:
         """The files of one frame, and where a view is interpolated also of its images before and after; a movie is the file of all."""

@@ -28,6 +28,10 @@ SHAPE_ROUNDS = 6
 SHAPE_ALPHA = 1e-3  # α of (1)
 FEW_TOGETHER = 0.25  # of the images in which a camera does not agree: those in which it does
 MANY_APART = 0.25  # of the images of a camera
+LONG_RUN = 3  # images one after another in which a camera does not agree: it was moved or exchanged
+FEWEST_SIDE = 3  # views before and after a camera was moved
+STEP_T = 6.0  # Student's t of its residuals, the largest of all frames
+STEP_PART = 0.3  # of sigma0 by which they must change
 MOST_LISTED = 8  # frames
 BENT = 0.004  # of the diagonal
 STRETCHED = 1e-3  # makes the scale uncertain by half of it, the limit of a good calibration
@@ -61,18 +65,54 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
     monitor.step("calibration", 4, 5)
     tested = without_outliers(first, labelled, used, prior, lambda boards, tolerance_px: with_boards(boards, labelled, tolerance_px))
     done = without_insignificant(*tested, labelled, monitor)
-    of_views, doubt_of_views = _remarks_on_views(labelled)
-    of_shape, doubt_of_shape = _remarks_on_shape(labelled.board.corners_m, tested[0].network.corners_m, labelled.length_m)
-    return replace(done, remarks=(*of_views, *of_shape), doubt=doubt_of_shape or doubt_of_views)
+    lines, doubts = _remarks_on_shape(labelled.board.corners_m, tested[0].network.corners_m, labelled.length_m)
+    for more in (_remarks_on_views(labelled), _remarks_on_moved_cameras(done)):
+        lines, doubts = lines + more[0], doubts + more[1]
+    return replace(done, remarks=tuple(lines), doubt=", and ".join(doubts))
 
 
-def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], str]:
-    """Lines about views that were not synchronised, and the doubt that they raise.
+def _remarks_on_moved_cameras(done: Calibration) -> tuple[list[str], list[str]]:
+    """Lines about cameras whose residuals are other ones from some frame on, and the doubt that this raises: the others yield to one.
+
+    The mean residuals of its views before and after a frame are compared (Student's t, at the frame with the largest).
+    """
+    lines, found = [], []
+    shared = done.observations.views(done.used) & done.observations.measured(done.used)[:, None]
+    order = np.argsort(done.observations.frames, kind="stable")
+    for c, name in enumerate(done.observations.names):
+        rows = order[shared[order, c]]
+        if len(rows) < 2 * FEWEST_SIDE:
+            continue
+        kept = done.used[rows, c]
+        mean_px = np.where(kept[..., None], done.residual_px[rows, c], 0.0).sum(axis=1) / kept.sum(axis=1)[:, None]
+        at, t, jump_px = _largest_step(mean_px)
+        if t > STEP_T and jump_px > STEP_PART * done.sigma0_px:
+            frame = done.observations.frames[rows[at]]
+            lines.append(f"the residuals of camera {name} change by {jump_px:.2f} px at frame {frame}")
+            found.append((t, f"camera {name}, or its neighbour, seems to have been moved before frame {frame}"))
+    return lines, [max(found)[1]] if found else []
+
+
+def _largest_step(values: np.ndarray) -> tuple[int, float, float]:
+    """Where a sequence (n, 2) changes most: the first index after the step, its t, and its height."""
+    best = (FEWEST_SIDE, 0.0, 0.0)
+    for k in range(FEWEST_SIDE, len(values) - FEWEST_SIDE + 1):
+        a, b = values[:k], values[k:]
+        variance = (np.sum((a - a.mean(axis=0)) ** 2, axis=0) + np.sum((b - b.mean(axis=0)) ** 2, axis=0)) / (len(values) - 2)
+        step = np.abs(a.mean(axis=0) - b.mean(axis=0))
+        t = float((step / np.sqrt(np.maximum(variance * (1 / len(a) + 1 / len(b)), 1e-18))).max())
+        if t > best[1]:
+            best = (k, t, float(np.linalg.norm(step)))
+    return best
+
+
+def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], list[str]]:
+    """Lines about views that were not synchronised, and the doubts that they raise.
 
     Raises:
         InputError: a camera does not agree with the others.
     """
-    lines, doubt = [], ""
+    lines, doubts = [], []
     apart = _apart(labelled)
     views = labelled.views(labelled.visible)
     shown = views.sum(axis=0)
@@ -89,14 +129,26 @@ def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], str]:
                 f"Camera {name} does not agree with the other cameras: only {together[c]} positions fit, {len(frames)} do not; "
                 "check that the recordings start at the same instant, and that no camera was moved or mirrored."
             )
-        if len(frames) > MANY_APART * shown[c]:
-            doubt = f"camera {name}, moved or not synchronised, disagrees with the others in {len(frames)} of its {shown[c]} images"
-    return lines, doubt
+        run = _longest_run(labelled.frames[views[:, c]], frames)
+        if len(frames) > MANY_APART * shown[c] or len(run) >= LONG_RUN:
+            where = f"in {len(frames)} of its {shown[c]} images"
+            if len(run) >= LONG_RUN:
+                where += f", among them all from {run[0]} to {run[-1]}"
+            doubts.append(f"camera {name}, moved, exchanged or not synchronised, disagrees with the others {where}")
+    return lines, doubts
 
 
-def _remarks_on_shape(plan_m: np.ndarray, corners_m: np.ndarray, length_m: float) -> tuple[list[str], str]:
-    """Lines about how far the corners (K, 3) of a board of some length are from their plan, and the doubt that this raises."""
-    lines, doubt = [], ""
+def _longest_run(shown: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """The longest series of the frames shown (n,) in which all are apart."""
+    frames = np.unique(shown)
+    stays = np.flatnonzero(np.concatenate([[True], ~np.isin(frames, apart), [True]]))
+    longest = int(np.argmax(np.diff(stays)))
+    return frames[stays[longest] : stays[longest + 1] - 1]
+
+
+def _remarks_on_shape(plan_m: np.ndarray, corners_m: np.ndarray, length_m: float) -> tuple[list[str], list[str]]:
+    """Lines about how far the corners (K, 3) of a board of some length are from their plan, and the doubts that this raises."""
+    lines, doubts = [], []
     deviation = corners_m - plan_m
     largest = float(np.linalg.norm(deviation, axis=1).max())
     if largest > 0:
@@ -107,15 +159,15 @@ def _remarks_on_shape(plan_m: np.ndarray, corners_m: np.ndarray, length_m: float
         )
     stretch = _stretch(plan_m, corners_m)
     if stretch > STRETCHED:
-        doubt = (
+        doubts.append(
             f"the squares are {100 * stretch:.2f} % longer one way than the other, so the scale is uncertain; measure them both ways, and "
             "print the board without scaling"
         )
     if largest > BENT * length_m:
-        doubt = (
+        doubts.append(
             f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm; glue it to a flat plate, and measure its squares both ways"
         )
-    return lines, doubt
+    return lines, doubts
 
 
 def _stretch(plan_m: np.ndarray, corners_m: np.ndarray) -> float:

@@ -110,14 +110,25 @@ def test_views_out_of_step_are_found_and_reported() -> None:
     assert error_m(held.cameras, done.rig.cameras) < 2.5 * bound_m(held, 0.1)
 
 
-def test_a_moved_camera_is_never_good() -> None:
+@pytest.mark.parametrize(
+    ("turned", "said"), [(0.01, "camera C, moved, exchanged or not synchronised"), (0.0005, "seems to have been moved")]
+)
+def test_a_moved_camera_is_never_good(turned: float, said: str) -> None:
     held = drawn(3, sigma_px=0.1)
     xy = held.xy_px.copy()
-    other = replace(held.cameras[1], R_cam_world=rotation_from_vector(np.array([0.0, 0.01, 0.0])) @ held.cameras[1].R_cam_world)
-    points = true_network(held).points_m
-    xy[18:, 1] = np.where(np.isfinite(xy[18:, 1]), other.project(points[18:]), np.nan)
+    other = replace(held.cameras[1], R_cam_world=rotation_from_vector(np.array([0.0, turned, 0.0])) @ held.cameras[1].R_cam_world)
+    seen = other.project(true_network(held).points_m[18:])
+    xy[18:, 1] = np.where(np.isfinite(xy[18:, 1]), seen + np.random.default_rng(1).normal(0, 0.1, seen.shape), np.nan)
     done = calibrate_rig(observed(replace(held, xy_px=xy)), Monitor())
-    assert done.verdict.light != "green" and "camera C, moved or not synchronised" in done.verdict.sentence
+    assert done.verdict.light != "green" and said in done.verdict.sentence
+
+
+def test_cameras_exchanged_towards_the_end_are_never_good() -> None:
+    held = drawn(3, sigma_px=0.1)
+    xy = held.xy_px.copy()
+    xy[25:, [0, 1]] = xy[25:, [1, 0]]
+    done = calibrate_rig(observed(replace(held, xy_px=xy)), Monitor())
+    assert done.verdict.light != "green" and "exchanged" in done.verdict.sentence
 
 
 def test_a_bent_board_is_measured_and_reported() -> None:

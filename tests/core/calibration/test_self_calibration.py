@@ -213,15 +213,14 @@ def waved_out_of_step(seed: int, delay_images: tuple[float, ...], positions: int
 
 @pytest.mark.parametrize("delay_images", [(0.0, 0.31, -0.46), (0.0, 4.2, -2.7)], ids=["parts of an image", "images"])
 def test_cameras_that_are_not_in_step_are_calibrated_as_well(delay_images: tuple[float, ...]) -> None:
-    together, apart = waved_out_of_step(3, (0.0, 0.0, 0.0)), waved_out_of_step(3, delay_images)
-    in_step, done = (calibrate_rig(observed(waved, labelled=False), Monitor()) for waved in (together, apart))
-    assert not in_step.calibration.delays
+    apart = waved_out_of_step(3, delay_images)
+    done = calibrate_rig(observed(apart, labelled=False), Monitor())
     found = done.calibration.delays
     assert list(found) == ["C", "R"]
     for (value, sigma), true in zip(found.values(), delay_images[1:]):
         assert abs(value - true) < 0.009  # 0.3 ms at 30 images/s
         assert 1e-4 < sigma < 0.009
-    assert error_m(apart.cameras, done.rig.cameras) < max(1.3 * error_m(together.cameras, in_step.rig.cameras), 3e-4)
+    assert error_m(apart.cameras, done.rig.cameras) < 3e-4
     page = report.page(done.calibration, done.quality, done.verdict)
     assert "Camera R took its images" in page and "than camera L; the adjustment allows for it." in page
 

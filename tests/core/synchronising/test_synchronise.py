@@ -157,3 +157,6 @@ def test_a_view_that_cannot_be_found_is_told_in_one_sentence(loose: Path, capsys
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("Nothing was written. View R: ") or "Nothing was written. View R: " in error
     assert re.search(said, error) and "Clap once" in error
+    assert main.main(["synchronise", str(loose)]) == 2
+    shown = capsys.readouterr().out.splitlines()
+    assert "by sound" in shown[0] and re.search(said, shown[2]), shown

@@ -103,6 +103,17 @@ def test_views_at_other_rates_show_the_instants_of_the_take(sixty: Path, tmp_pat
     assert list(footage.frames_of_images(0, np.array([0, 1, 2]))) == [1, -1, 2]
 
 
+def test_how_far_images_stray_when_they_are_played_one_after_another(sixty: Path, tmp_path: Path) -> None:
+    take = loose(sixty, tmp_path / "take", {"L": range(18), "C": range(9), "R": range(9)})
+    steady = "view,time_s\n" + "".join(f"R,{n / 30}\n" for n in range(9))
+    for times, strays in ((steady, 0.0), (steady.replace("R,0.0\n", "R,-0.1\n"), 3.0)):  # three frames are missing after image 0
+        (take.folder / "timestamps.csv").write_text(times)
+        views = tuple(replace(v, **c) for v, c in zip(take.views, ({"fps": 60.0}, {}, {"timestamps": "timestamps.csv"})))
+        footage = open_take(replace(take, views=views))
+        assert footage.strays_frames(1, 0) == 0.0 and footage.strays_frames(2, 0) == strays
+        assert footage.strays_frames(0, 0) == footage.frames.stop - 1  # twice as many images as frames
+
+
 def test_keys_of_stages_follow_clocks(sixty: Path, tmp_path: Path) -> None:
     take = replace(read_take(sixty), clicks=FrameClicks())
     settings, keys = settings_of({}, {}, "x"), set()
