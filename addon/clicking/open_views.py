@@ -8,7 +8,9 @@ from ...core.foundation.errors import InputError
 from .. import clicks, project
 from ..overlay import canvas
 
-NAME = "Tricap Clicks"
+NAME, REVIEW = "Tricap Clicks", "Tricap Review"
+OURS = (NAME, REVIEW)
+NO_WINDOW = "Views can only be opened in Blender's window, not in background mode."
 FROM_KEY = "tricap_from"  # custom property of the workspace: the one from which it was opened
 SHOWN = (
     ("nothing", "Nothing", "The footage alone"),
@@ -44,25 +46,35 @@ class OpenViews(bpy.types.Operator):
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        window, ours = context.window, bpy.data.workspaces.get(NAME)
+        window = context.window
         if window is None:
-            self.report({"ERROR"}, "Views can only be opened in Blender's window, not in background mode.")
+            self.report({"ERROR"}, NO_WINDOW)
             return {"CANCELLED"}
-        if ours is None:
-            before = set(bpy.data.workspaces)
-            bpy.ops.workspace.duplicate()
-            (ours,) = set(bpy.data.workspaces) - before
-            ours.name = NAME
-        if window.workspace != ours:
-            ours[FROM_KEY] = window.workspace.name
-            window.workspace = ours
+        go_to(window, NAME)
         if self.show != "nothing":
             setattr(context.scene.tricap_overlay, self.show, True)
         if not any(clicks.clicked_frames(clip) for clip in clips):
             context.scene.frame_set(context.scene.tricap.seed_frame)
-        names = [clip.name for clip in clips]
-        bpy.app.timers.register(_waiter(window, names, switches=self.show != "nothing"), first_interval=SOON_S)
+        names, switches = [clip.name for clip in clips], self.show != "nothing"
+
+        def layout() -> Iterator[str]:
+            return lay_out(window, [bpy.data.movieclips[name] for name in names if name in bpy.data.movieclips], switches=switches)
+
+        lay_out_soon(window, NAME, layout)
         return {"FINISHED"}
+
+
+def go_to(window: bpy.types.Window, name: str) -> None:
+    """Show the workspace `name` in a window, made as a copy of the one that is shown if it does not exist."""
+    ours = bpy.data.workspaces.get(name)
+    if ours is None:
+        before = set(bpy.data.workspaces)
+        bpy.ops.workspace.duplicate()
+        (ours,) = set(bpy.data.workspaces) - before
+        ours.name = name
+    if window.workspace != ours:
+        ours[FROM_KEY] = window.workspace.name
+        window.workspace = ours
 
 
 class BackToSteps(bpy.types.Operator):
@@ -74,11 +86,11 @@ class BackToSteps(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only in the views' workspace."""
-        return context.workspace is not None and context.workspace.name == NAME
+        return context.workspace is not None and context.workspace.name in OURS
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Show that workspace; if it was deleted, any other with a 3-D view."""
-        others = [w for w in bpy.data.workspaces if w.name != NAME]
+        others = [w for w in bpy.data.workspaces if w.name not in OURS]
         spatial = [w for w in others if any(a.type == "VIEW_3D" for screen in w.screens for a in screen.areas)]
         origin = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
         back = origin if origin in others else next(iter([*spatial, *others]), None)
@@ -96,22 +108,21 @@ def draw_back(header: bpy.types.Header, context: bpy.types.Context) -> None:
         header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
 
 
-def _waiter(window: bpy.types.Window, clip_names: Sequence[str], *, switches: bool) -> Callable[[], float | None]:
-    """A timer that lays out the views once the window shows the workspace, step by step."""
-    left, steps = [TRIES], []
+def lay_out_soon(window: bpy.types.Window, workspace: str, layout: Callable[[], Iterator[str]]) -> None:
+    """Lay out a workspace as soon as the window shows it, step by step."""
+    left, steps = [TRIES], list[Iterator[str]]()
 
     def wait() -> float | None:
         left[0] -= 1
         if left[0] <= 0 or window not in bpy.context.window_manager.windows[:]:
             return None
-        if window.workspace.name != NAME:
+        if window.workspace.name != workspace:
             return SOON_S
         if not steps:
-            clips = [bpy.data.movieclips[name] for name in clip_names if name in bpy.data.movieclips]
-            steps.append(lay_out(window, clips, switches=switches))
+            steps.append(layout())
         return SOON_S if next(steps[0], None) else None
 
-    return wait
+    bpy.app.timers.register(wait, first_interval=SOON_S)
 
 
 def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, switches: bool = False) -> Iterator[str]:
@@ -122,7 +133,7 @@ def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, s
     editors = [a for a in window.screen.areas if a.type == "CLIP_EDITOR"]
     if not editors:
         if not bpy.app.background:  # closing an area without a window ends Blender
-            _close_others(window)
+            close_others(window)
             yield "others closed"
         largest = max(window.screen.areas, key=lambda a: a.width * a.height)
         rows = 1 if len(clips) <= 3 else 2 if len(clips) <= 6 else 3
@@ -134,7 +145,7 @@ def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, s
     yield "columns"
     editors = sorted((a for a in window.screen.areas if a.type == "CLIP_EDITOR"), key=lambda a: (-a.y, a.x))
     for editor, clip in zip(editors, clips):
-        _show(editor, clip)
+        show_clip(editor, clip)
     if switches:
         editors[-1].spaces.active.show_region_ui = True
     yield "shown"
@@ -155,7 +166,8 @@ def _split(window: bpy.types.Window, area: bpy.types.Area, parts: int, direction
     return [a for a in window.screen.areas if a not in before]
 
 
-def _show(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
+def show_clip(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
+    """Let an area show a clip as footage to click in."""
     area.type = "CLIP_EDITOR"
     space = area.spaces.active
     space.mode, space.view = "TRACKING", "CLIP"
@@ -166,7 +178,7 @@ def _show(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
     space.clip_user.use_render_undistorted = False
 
 
-def _close_others(window: bpy.types.Window) -> None:
+def close_others(window: bpy.types.Window) -> None:
     for area in [a for a in window.screen.areas if a.type in CLOSED]:
         with bpy.context.temp_override(window=window, area=area):
             bpy.ops.screen.area_close()

@@ -175,6 +175,8 @@ def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Fit the body; locked and limited degrees of freedom."""
     _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
+    if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
+        offer(layout, "tricap.review", icon="VIEWZOOM")
     draw_dofs(layout, context.scene)
 
 

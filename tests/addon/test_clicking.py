@@ -287,6 +287,21 @@ def test_the_views_share_the_largest_area(blender: ModuleType, scene: Any) -> No
     assert all(area.spaces.active.mode == "TRACKING" for area in editors) and others <= {area.type for area in window.screen.areas}
 
 
+def test_body_and_footage_share_the_largest_area(blender: ModuleType, scene: Any) -> None:
+    window = blender.context.window_manager.windows[0]
+    review, clip = module("correcting.review"), module("project").clips_of(scene)["C"]
+    assert not blender.ops.tricap.review.poll(), "there is no body"
+    assert list(review.lay_out(window, clip.name)) == ["split", "shown"]
+    shown = {area.type: area for area in window.screen.areas if area.type in ("CLIP_EDITOR", "VIEW_3D")}
+    assert len(shown) == 2 and shown["CLIP_EDITOR"].spaces.active.clip == clip
+    assert list(review.lay_out(window, clip.name)) == [], "a second time nothing is split"
+    blender.ops.mesh.primitive_cube_add(location=(3.0, 0.0, 1.0))
+    blender.context.view_layer.update()
+    view = shown["VIEW_3D"].spaces.active.region_3d
+    review.frame(view, blender.context.object)
+    assert tuple(view.view_location) == pytest.approx((3.0, 0.0, 1.0)) and view.view_distance == pytest.approx(1.5 * 12**0.5, rel=1e-5)
+
+
 class _Region(SimpleNamespace):
     """A region as the window has it; one that was never drawn does not know where its picture lies."""
 
