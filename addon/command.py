@@ -9,24 +9,25 @@ from pathlib import Path
 from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
-from ..core.cli import main as commands
+from ..core.body.skin.mesh import DETAIL
 from ..core.cli.arguments import check_simplify, standard_output_kept_clean
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
-from .movie_sound import movie_sound
 from .retarget import command as retargeting
-
-DETAIL = 2  # that of body/skin/closed_skin.py, which is imported only when a scene is built
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command of the `tricap` command line, of the core's or of those that need Blender; its exit code (docs/formats.md)."""
+    from ..core.cli import main as commands
+
     return commands.main(argv, (add_commands, retargeting.add_commands))
 
 
 def add_commands(subparsers: Any) -> None:
     """Add the sub-command `scene` to an argparse sub-parsers object; its `run(args, monitor)` returns lines to print."""
     if importlib.util.find_spec("bpy") is not None:
+        from .movie_sound import movie_sound
+
         subparsers.choices["synchronise"].set_defaults(movie_sound=movie_sound)
     about = "a Blender file with armature, action, skins, cameras, footage, cloud and trajectories"
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)

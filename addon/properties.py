@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ..core.foundation import settings as knobs
-from ..core.run import take_run
+from ..core.run.settings import SETTINGS, settings_of
 from . import take_properties
 from .editing import foot_lock, uncertainty
 from .scene import metaballs, standing
@@ -88,7 +88,7 @@ def check_settings(tables: Mapping[str, Mapping[str, Any]], where: str) -> None:
     Raises:
         InputError: a name is unknown or a value invalid.
     """
-    take_run.settings_of(tables, {}, where)
+    settings_of(tables, {}, where)
 
 
 def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]]) -> None:
@@ -112,7 +112,7 @@ def changed_settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 def stages() -> Mapping[str, type]:
     """The settings class of every stage, by its name in take.toml."""
-    return take_run.SETTINGS
+    return SETTINGS
 
 
 def exact(value: Any, default: Any = 0.0) -> Any:

@@ -19,7 +19,7 @@ from ..core.take.take import read_take
 from ..core.take.writing import read_table
 from . import folders, project, properties
 from .scene import armature, clips
-from .scene.build import OUT_KEY, PLACES_KEY
+from .scene.options import OUT_KEY, PLACES_KEY
 from .session import get_session
 
 

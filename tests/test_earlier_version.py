@@ -17,6 +17,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.results.run_json import read_run
+from tricap.core.run import settings as run_settings
 from tricap.core.run import take_run
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
@@ -26,7 +27,7 @@ from .core.conftest import Body, three_cameras, write_take
 VERSION_0_1 = Path(__file__).parent / "version_0_1"
 RENAMED = [
     (group, field, earlier)
-    for group, settings in take_run.SETTINGS.items()
+    for group, settings in run_settings.SETTINGS.items()
     for field in dataclasses.fields(settings)
     for earlier in field.metadata["was"]
 ]
@@ -80,7 +81,7 @@ def test_every_key_of_the_take_is_read(take: Path) -> None:
     assert main(["check", str(take), "--quiet"]) in (0, 1)
 
 
-@pytest.mark.parametrize("group", [group for group in read_table(VERSION_0_1)["settings"] if group in take_run.SETTINGS])
+@pytest.mark.parametrize("group", [group for group in read_table(VERSION_0_1)["settings"] if group in run_settings.SETTINGS])
 def test_every_setting_of_the_take_has_its_value(group: str) -> None:
     tables = read_table(VERSION_0_1)["settings"]
     settings = take_run.settings_of(tables, {}, "take.toml")

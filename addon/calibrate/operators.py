@@ -3,23 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ...core.calibration.boards.board import Board, BoardKind, write_board
-from ...core.calibration.boards.footage import BoardFootage, measure_boards
-from ...core.calibration.calibrate import (
-    BarFootage,
-    CalibratedRig,
-    MeasuredBar,
-    calibrate_rig,
-    measure_bar,
-    open_bar,
-    open_boards,
-    write_report,
-)
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
 from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
@@ -33,6 +23,10 @@ from ..session import get_session
 from ..steps.cameras import use_rig
 from .cameras import build_cameras, rig_of_scene
 
+if TYPE_CHECKING:
+    from ...core.calibration.boards.footage import BoardFootage
+    from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar
+
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
@@ -45,7 +39,7 @@ class Done:
     # of a wand, one frame an image as the clips show them, of both fields the first:
     tracks: dict[str, np.ndarray]  # its targets (T, 2, 2) by view
     bar: tuple[np.ndarray, np.ndarray] | None  # frames (T,) and ends (T, 2, 3) [m]
-    result: CalibratedRig
+    result: "CalibratedRig"
     written: Path
 
 
@@ -80,6 +74,9 @@ class Calibrate(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Done]:
         """Folder, target and options as they are now."""
+        from ...core.calibration import calibrate
+        from ...core.calibration.boards.footage import measure_boards
+
         props = context.scene.tricap_calibrate
         if not (self.bar or props.bar):
             raise InputError("Choose the target footage first: the folder that contains a folder of images, or a movie, for each camera.")
@@ -96,15 +93,16 @@ class Calibrate(JobOperator, bpy.types.Operator):
         get_session().file.bar_counts.clear()
 
         def from_wand(monitor: Monitor) -> Done:
-            footage = open_bar(folder, interlaced, mask, first_field)
-            measured = measure_bar(footage, length, monitor, note_count, diameter or None)
-            return compute_wand(footage, measured, calibrate_rig(measured.observations, monitor, focal_px=focal, world=world), out)
+            footage = calibrate.open_bar(folder, interlaced, mask, first_field)
+            measured = calibrate.measure_bar(footage, length, monitor, note_count, diameter or None)
+            result = calibrate.calibrate_rig(measured.observations, monitor, focal_px=focal, world=world)
+            return compute_wand(footage, measured, result, out)
 
         def from_board(monitor: Monitor) -> Done:
             assert board is not None
-            footage = open_boards(folder)
+            footage = calibrate.open_boards(folder)
             observations = measure_boards(footage, board, monitor, note_count)
-            result = calibrate_rig(observations, monitor, focal_px=focal, world=world)
+            result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, world=world)
             write(result, out)
             return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out)
 
@@ -167,18 +165,20 @@ def board_of(props: bpy.types.PropertyGroup) -> Board:
     )
 
 
-def files_of(footage: BarFootage | BoardFootage) -> dict[str, list[Path]]:
+def files_of(footage: "BarFootage | BoardFootage") -> dict[str, list[Path]]:
     """The files of each view."""
     return {name: list(s.files()) for name, s in zip(footage.names, footage.sequences)}
 
 
-def write(result: CalibratedRig, out: Path) -> None:
+def write(result: "CalibratedRig", out: Path) -> None:
     """Write rig.toml and its report."""
+    from ...core.calibration.calibrate import write_report
+
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)
 
 
-def compute_wand(footage: BarFootage, measured: MeasuredBar, result: CalibratedRig, out: Path) -> Done:
+def compute_wand(footage: "BarFootage", measured: "MeasuredBar", result: "CalibratedRig", out: Path) -> Done:
     """Write rig.toml with the wand next to it; what the scene shows, one frame an image."""
     write(result, out)
     (frames, ends), per = result.bar, footage.field_layout.per_image

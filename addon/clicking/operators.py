@@ -8,7 +8,7 @@ import bpy
 
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.foundation.errors import InputError
-from ...core.run import take_run
+from ...core.run.settings import settings_of
 from ...core.take.footage import open_take
 from ...core.take.take import JOINTS, FrameClicks
 from .. import clicks, project, properties
@@ -301,7 +301,7 @@ def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
     """The finder of proposals; None and the reason if cameras or images are missing."""
     try:
         take = project.take(scene)
-        settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")
+        settings = settings_of(take.settings, properties.overrides(scene), "take.toml")
         bare = replace(take, clicks=FrameClicks(), keyframes=(), corrections=(), frames=None)
         footage = open_take(bare, click_sigma_px=settings["fitting"].click_sigma_px)
     except InputError as error:

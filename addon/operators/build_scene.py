@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 from mathutils import Matrix, Vector
@@ -14,11 +15,13 @@ from ...core.foundation.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
 from ..scene import armature
-from ..scene import build as scene_build
-from ..scene.build import DEFAULTS, SceneOptions, SceneReport, write_scene
 from ..scene.cloud import COLOURS
-from ..scene.contents import Contents, read_contents
+from ..scene.options import DEFAULTS, SceneOptions
 from ..scene.rest_pose import POSES
+
+if TYPE_CHECKING:
+    from ..scene.build import SceneReport
+    from ..scene.contents import Contents
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -85,12 +88,14 @@ class BuildScene(JobOperator, bpy.types.Operator):
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
     arrows: bpy.props.BoolProperty(name="Velocity Arrows", default=False)  # type: ignore[valid-type]
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], Contents]":
         """The folder with the results."""
+        from ..scene.contents import read_contents
+
         out, skins = folders.output_folder(self.out, context.scene), self.exact_skin
         return lambda monitor: read_contents(out, monitor, skins=skins)
 
-    def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "Contents") -> set[str]:
         """Build the scene from what was read."""
         options = SceneOptions(
             rest_pose=self.rest_pose,
@@ -109,11 +114,13 @@ class BuildScene(JobOperator, bpy.types.Operator):
 def put_into_scene(
     operator: bpy.types.Operator,
     context: bpy.types.Context,
-    contents: Contents,
+    contents: "Contents",
     blend: Path | None = None,
     options: SceneOptions = DEFAULTS,
 ) -> None:
     """Build the scene and report its contents; the first time, frame the body in the 3-D views."""
+    from ..scene.build import write_scene
+
     first = armature.NAME not in bpy.data.objects
     report_scene(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
@@ -124,13 +131,15 @@ def put_into_scene(
         _frame(operator, context, body)
 
 
-def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
+def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: "Contents") -> None:
     """Show the results that there are over the footage: cameras, then the cloud, then trajectories.
 
     A scene with a body stays as it is, with its edits, and so does one whose cameras were calibrated or imported in it: they would be there
     twice. The first time, the 3-D views look through the scene's camera.
     """
-    collections = scene_build.built_collections(context.scene)
+    from ..scene.build import built_collections, write_scene
+
+    collections = built_collections(context.scene)
     built = {thing for collection in collections for thing in collection.all_objects}
     own_cameras = any(thing.type == "CAMERA" and "tricap_view" in thing and thing not in built for thing in context.scene.objects)
     if own_cameras or any(thing.type == "ARMATURE" for thing in built):
@@ -194,7 +203,7 @@ def _is_default_camera(camera: bpy.types.Object) -> bool:
     return camera.type == "CAMERA" and there and not used and not camera.animation_data and not camera.hide_get()
 
 
-def report_scene(operator: bpy.types.Operator, report: SceneReport) -> None:
+def report_scene(operator: bpy.types.Operator, report: "SceneReport") -> None:
     """Report what was built, and what is missing."""
     for warning in report.warnings:
         operator.report({"WARNING"}, warning)

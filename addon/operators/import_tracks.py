@@ -1,16 +1,17 @@
 """bpy.ops.tricap.import_tracks2d(filepath="tracks.csv", points="points.csv", footage="face.mp4")"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
-from ...core.cli.track2d import open_footage
 from ...core.foundation.errors import InputError
 from ...core.foundation.settings import nearest_name
-from ...core.tracking.point_tables import PlanarTable, read_planar, read_points
 from .. import folders
 from ..panels import TellingOperator
-from ..scene.planar import add_planar
+
+if TYPE_CHECKING:
+    from ...core.tracking.point_tables import PlanarTable
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -42,6 +43,10 @@ class ImportTracks2d(TellingOperator, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Read the files, then build."""
+        from ...core.cli.track2d import open_footage
+        from ...core.tracking.point_tables import read_planar
+        from ..scene.planar import add_planar
+
         table = read_planar(folders.absolute(self.filepath))
         joined = read_joints(folders.absolute(self.points), table) if self.points else ()
         footage = open_footage(folders.absolute(self.footage)) if self.footage else None
@@ -49,12 +54,14 @@ class ImportTracks2d(TellingOperator, bpy.types.Operator):
         return f"{made.name}: {len(table.names)} points over {len(table.frames)} frames, {len(joined)} curves"
 
 
-def read_joints(path: Path, table: PlanarTable) -> tuple[tuple[str, str], ...]:
+def read_joints(path: Path, table: "PlanarTable") -> tuple[tuple[str, str], ...]:
     """The pairs of points to join.
 
     Raises:
         InputError: the file is not a table of points, or joins a point that was not tracked.
     """
+    from ...core.tracking.point_tables import read_points
+
     joined = read_points(path).joined
     for name in (name for pair in joined for name in pair):
         if name not in table.names:

@@ -2,26 +2,27 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
 from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline, take_run
-from ...core.run.engine import of_this_machine
-from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from .. import folders, project
 from ..jobs import JobOperator
-from ..scene.contents import Contents, read_contents
 from ..session import get_session
 from .build_scene import RELATIVE, put_into_scene
 from .stages import StageOperator, report_run
 
+if TYPE_CHECKING:
+    from ...core.run.take_run import Run as TakeRun
+    from ..scene.contents import Contents
+
 SAMPLE_NAME = "tricap_sample"
 EXTENSION = __package__.rpartition(".addon")[0]
-SAMPLE = ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none")
+SAMPLE = MappingProxyType({"frames": 12, "fps": 15.0, "width_px": 512, "interlaced": "none"})  # of core.synthetic.arm.ArmTakeSettings
 
 
 class Run(StageOperator, bpy.types.Operator):
@@ -50,13 +51,13 @@ class Run(StageOperator, bpy.types.Operator):
         description="Build the results in this scene afterwards",
     )
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[take_run.Run, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[TakeRun, Contents | None]]":
         """Folders and settings as they are now."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)
         build = self.build
         return lambda monitor: measure(take, out, overrides, build, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[take_run.Run, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "tuple[TakeRun, Contents | None]") -> set[str]:
         """Build the scene and report the run."""
         run, contents = result
         if contents is not None:
@@ -67,9 +68,14 @@ class Run(StageOperator, bpy.types.Operator):
 
 def measure(
     take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor
-) -> tuple[take_run.Run, Contents | None]:
+) -> "tuple[TakeRun, Contents | None]":
     """The computation, without bpy: all stages that are not done, and their results read for the scene."""
-    with take_run.open_run(take, out, overrides) as run:
+    from ...core.run import pipeline
+    from ...core.run.engine import of_this_machine
+    from ...core.run.take_run import open_run
+    from ..scene.contents import read_contents
+
+    with open_run(take, out, overrides) as run:
         if not pipeline.is_complete(run):
             run.engine = of_this_machine()
             pipeline.all_stages(run, monitor)
@@ -84,7 +90,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
     bl_label = "Load Sample and Run"
     bl_options = {"UNDO"}
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, take_run.Run, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[Path, TakeRun, Contents | None]]":
         """The folder of the recording: next to the .blend, or in the extension's user folder if the file was never saved."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
         take = base / SAMPLE_NAME
@@ -93,7 +99,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
         folders.check_writable(base)
         return lambda monitor: make_sample(take, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[Path, take_run.Run, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "tuple[Path, TakeRun, Contents | None]") -> set[str]:
         """Open the sample as the scene's project, and build the scene."""
         take, run, contents = result
         project.open_take(context.scene, take)
@@ -104,10 +110,12 @@ class LoadSample(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def make_sample(take: Path, monitor: Monitor) -> tuple[Path, take_run.Run, Contents | None]:
+def make_sample(take: Path, monitor: Monitor) -> "tuple[Path, TakeRun, Contents | None]":
     """The computation, without bpy. An existing sample is measured as it is, including changes."""
+    from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
+
     if not is_arm_take(take):
-        make_arm_take(take, SAMPLE, monitor)
+        make_arm_take(take, ArmTakeSettings(**SAMPLE), monitor)
     return take, *measure(take, take / project.RESULTS, {}, True, monitor)
 
 

@@ -3,19 +3,18 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
-from ...core.fitting.inputs.take_inputs import check_body
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline, take_run
-from ...core.run.engine import of_this_machine
-from ...core.run.phases import course_of
 from .. import project
 from ..jobs import JobOperator
-from ..scene.contents import Contents, read_contents
 from .build_scene import RELATIVE, show_so_far
+
+if TYPE_CHECKING:
+    from ...core.run.take_run import Run
+    from ..scene.contents import Contents
 
 STEP_OF_TASK = MappingProxyType({"measure": "surface", "track": "tracks", "fit": "body", "report": "body", "build": "rig"})
 
@@ -26,13 +25,13 @@ class StageOperator(JobOperator):
     stages: ClassVar[tuple[str, ...]] = ()
     steps = STEP_OF_TASK
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[take_run.Run, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[Run, Contents | None]]":
         """Folders and settings as they are now; writes the project's take.toml."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
         stages, shown = self.stages, project.bound(context.scene) and not self.out  # type: ignore[attr-defined]
         return lambda monitor: run_and_read(take, out, overrides, stages, shown, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[take_run.Run, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "tuple[Run, Contents | None]") -> set[str]:
         """Show what was measured in the viewport, and report the run."""
         run, contents = result
         if contents is not None:
@@ -43,13 +42,15 @@ class StageOperator(JobOperator):
 
 def run_and_read(
     take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], shown: bool, monitor: Monitor
-) -> tuple[take_run.Run, Contents | None]:
+) -> "tuple[Run, Contents | None]":
     """The computation, without bpy: the stages, and if they are `shown`, what they measured."""
+    from ..scene.contents import read_contents
+
     run = run_stages(take, out, overrides, names, monitor)
     return run, read_contents(out, monitor) if shown and "fit" not in names else None
 
 
-def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> None:
+def report_run(operator: Any, context: bpy.types.Context, run: "Run") -> None:
     """Show a run's warnings and its summary, and store the summary for the panel."""
     context.scene.tricap.last = str(run)
     for sentence in run.record["warnings"]:
@@ -57,9 +58,15 @@ def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> 
     operator.report({"INFO"}, str(run))
 
 
-def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> take_run.Run:
+def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> "Run":
     """The computation, without bpy. Frames that have a checkpoint are not computed again."""
-    with take_run.open_run(take, out, overrides) as run:
+    from ...core.fitting.inputs.take_inputs import check_body
+    from ...core.run import pipeline
+    from ...core.run.engine import of_this_machine
+    from ...core.run.phases import course_of
+    from ...core.run.take_run import open_run
+
+    with open_run(take, out, overrides) as run:
         if "fit" in names:
             check_body(run.footage, run.settings["fitting"])
         run.engine = of_this_machine()

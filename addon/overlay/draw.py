@@ -2,17 +2,19 @@
 setting."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
 
-from ...core.run.record import FrameTable
 from ..session import get_session
 from . import canvas, layers, results
 from .canvas import Canvas, Colour
 from .layers import Inspection
 from .results import RunResults
+
+if TYPE_CHECKING:
+    from ...core.run.record import FrameTable
 
 POINT_PX, LINE_PX = 3.0, 2.2
 BODY: Colour = (1.0, 0.6, 0.1, 1.0)
@@ -231,7 +233,7 @@ def _draw_graph(run: RunResults, frame: int, sheet: Canvas) -> None:
     canvas.text(str(last), left + width - canvas.text_width(str(last), size=10), bottom - 14 * scale, size=10)
 
 
-def _draw_curves(table: FrameTable, x: np.ndarray, left: float, bottom: float, height: float) -> None:
+def _draw_curves(table: "FrameTable", x: np.ndarray, left: float, bottom: float, height: float) -> None:
     scale, label_x = bpy.context.preferences.system.ui_scale, left
     middle = np.array([[(x[0], bottom + height / 2), (x[-1], bottom + height / 2)]])
     canvas.draw_lines(canvas.line_batch(middle), 1.0, (1.0, 1.0, 1.0, 0.2))

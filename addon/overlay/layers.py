@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...core.geometry.robust import finite_median
-from ...core.run.inspection import TrackHistory, patch_boxes
 from ...core.surface.cloud import FILTERS
 from ...core.tracking.settings import TrackStatus
 
 if TYPE_CHECKING:
+    from ...core.run.inspection import TrackHistory
     from .results import RunResults
 
 ALL = "ALL"  # every filter
@@ -87,7 +87,7 @@ def tails(run: "RunResults", view: str, frame: int, length: int, which: str, by:
     return np.concatenate([segments for (segments, _, _), _ in parts]), np.concatenate(colours)
 
 
-def removal_counts(history: TrackHistory, frame: int, by: str = ALL) -> list[tuple[str, int]]:
+def removal_counts(history: "TrackHistory", frame: int, by: str = ALL) -> list[tuple[str, int]]:
     """Why positions were removed from a frame, and how many for each reason, the most frequent first."""
     now = np.flatnonzero(history.frames == frame)
     if not len(now):
@@ -119,6 +119,8 @@ def inspect(run: "RunResults", view: str, frame: int, xy_px: np.ndarray, reach_p
         places = dict(zip(views, points.xy_px[row]))
         if np.isfinite(points.residual_px[row]):
             lines.append(f"residual {points.residual_px[row]:.2f} px, correlation {points.correlation[row]:.2f}")
+            from ...core.run.inspection import patch_boxes
+
             start_boxes, matched_boxes = patch_boxes(
                 points, row, list(run.cameras.values()), run.reference, run.rows_at(frame), run.patch_px
             )

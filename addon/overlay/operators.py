@@ -2,18 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 
-from ...core.cli.contour import Start, write_contours
 from ...core.foundation.progress import Monitor
-from ...core.run import take_run
+from ...core.run.settings import Overrides
 from .. import project
 from ..jobs import JobOperator
 from ..panels import show_status
 from ..session import get_session
 from . import canvas, draw, layers, results
+
+if TYPE_CHECKING:
+    from ...core.cli.contour import Start
 
 REACH_SCREEN_PX = 14.0  # around the pointer
 
@@ -95,6 +98,8 @@ class FollowContours(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], list[str]]:
         """Read folders and settings; write the project's take.toml."""
+        from ...core.cli.contour import Start
+
         take, out, overrides = project.chosen(context.scene, "", "")
         view, start = self.view, Start(body=self.from_body)
         return lambda monitor: track_outline(take, out, overrides, view, monitor, start)
@@ -109,9 +114,12 @@ class FollowContours(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def track_outline(take: Path, out: Path, overrides: take_run.Overrides, view: str, monitor: Monitor, start: Start) -> list[str]:
+def track_outline(take: Path, out: Path, overrides: Overrides, view: str, monitor: Monitor, start: "Start") -> list[str]:
     """The computation, without bpy: a sentence for each view."""
-    with take_run.open_run(take, out, overrides, ignore_contours=True) as run:
+    from ...core.cli.contour import write_contours
+    from ...core.run.take_run import open_run
+
+    with open_run(take, out, overrides, ignore_contours=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
         return write_contours(run, names, monitor, start)
 

@@ -4,7 +4,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
@@ -15,13 +15,15 @@ from ...core.geometry.camera import Camera
 from ...core.images.interlace import RowGrid
 from ...core.matching.least_squares import MatchingSettings
 from ...core.results.run_json import read_run
-from ...core.run.inspection import FramePoints, TrackHistory, body_outline, read_points, read_removed, read_tracks
-from ...core.run.record import FrameTable, read_frame_table
 from ...core.take.footage import open_take
 from ...core.take.take import read_take
 from ...core.tracking.contour import Contour, ContourTable
 from .. import folders, project
 from ..session import OpenResults, get_session
+
+if TYPE_CHECKING:
+    from ...core.run.inspection import FramePoints, TrackHistory
+    from ...core.run.record import FrameTable
 
 CACHED_FRAMES = 48  # things of single frames that are cached at most
 
@@ -38,21 +40,29 @@ class RunResults:
     problem: str = ""
     _read: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
 
-    def points(self, frame: int) -> FramePoints | None:
+    def points(self, frame: int) -> "FramePoints | None":
         """The points of a frame, if it has any."""
+        from ...core.run.inspection import read_points
+
         return self.cached(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows_at(frame)))
 
     def removed(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (M, K, 2) of the points that the surface's filters removed from a frame, and which filter did (M,)."""
+        from ...core.run.inspection import read_removed
+
         found: tuple[np.ndarray, np.ndarray] = self.cached(("removed", frame), lambda: read_removed(self.out, frame))
         return found
 
-    def tracks(self) -> TrackHistory | None:
+    def tracks(self) -> "TrackHistory | None":
         """All trajectories, if there are any."""
+        from ...core.run.inspection import read_tracks
+
         return self.cached("tracks", lambda: read_tracks(self.out))
 
     def outline(self, view: str, frame: int) -> list[Any]:
         """The fitted body's outline."""
+        from ...core.run.inspection import body_outline
+
         return self.cached(("outline", view, frame), lambda: body_outline(self.out, frame, self.cameras[view])) or []
 
     def contours(self, view: str) -> Mapping[int, Contour]:
@@ -63,8 +73,10 @@ class RunResults:
         """The tracked contour in a frame, if there is one."""
         return self.cached(("contour", view, frame), lambda: self.contours(view).get(frame))  # type: ignore[no-any-return]
 
-    def table(self) -> FrameTable | None:
+    def table(self) -> "FrameTable | None":
         """The quality of the frames, if a run wrote it."""
+        from ...core.run.record import read_frame_table
+
         path = self.out / "frames.csv"
         return self.cached("table", lambda: read_frame_table(path) if path.is_file() else None)
 

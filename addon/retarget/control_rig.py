@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import atan2
+from typing import TYPE_CHECKING
 
 import addon_utils
 import bpy
@@ -19,7 +20,6 @@ from mathutils import Matrix, Vector
 
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
-from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
 from ..scene.armature import RIG_KEY, SNAPS_KEY
 from ..scene.standing import ROOT
@@ -27,6 +27,9 @@ from . import metarig
 from .playing import played_frames
 from .read import orthonormal, read_motion, read_rig, world_matrix
 from .write import push_to_strip, write_action
+
+if TYPE_CHECKING:
+    from ...core.motion.retarget.retarget import Retargeted
 
 CONSTRAINT = "Control rig"
 DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
@@ -174,12 +177,14 @@ def _targets(controls: Rig, body: bpy.types.Object, rig: bpy.types.Object, motio
     return since_rest @ object_R @ A @ object_R.T @ controls.R_rest, motion.head_m[:, rows]
 
 
-def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray) -> Retargeted:
+def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray) -> "Retargeted":
     """The root keeps to the floor under the person; the pelvis carries the rest."""
     root, pelvis = controls.index[ROOT], controls.index["pelvis"]
     path = place[:, root] - controls.head_m[root]
     shift = place[:, pelvis] - (controls.head_m[pelvis] + path)
     played = Motion(rig=controls, fps=motion.fps, frames=motion.frames, R=R, head_m=place)
+    from ...core.motion.retarget.retarget import Retargeted
+
     return Retargeted(
         motion=played,
         basis=channels(controls, R),

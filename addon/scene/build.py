@@ -14,8 +14,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...core.body.fields import EXPONENTIAL, potential_named
-from ...core.body.skin.closed_skin import DETAIL
+from ...core.body.fields import potential_named
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
 from ...core.foundation.bounded import real_path
@@ -28,37 +27,15 @@ from ...core.take.footage import Footage
 from . import action, armature, cameras, clips, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
+from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
 from .rest_pose import with_rest_pose
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
 MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
-OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
-PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
 PART_KEY = "tricap_part"  # custom property of the collections in it: Body, Cameras, Measured, …
 DOUBTFUL = "Doubtful"  # the first word of the timeline's markers of doubtful stretches
-KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """The user's choices for a scene."""
-
-    detail: int = DETAIL  # of the skin: pieces per edge
-    exact_skin: bool = False  # also the skin cast in every frame: a mesh cache next to the .blend
-    implicit: bool = False  # also the implicit surface itself
-    field: str = EXPONENTIAL.name  # of the implicit surface, one of core.body.fields.POTENTIALS
-    rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
-    simplify_deg: float = 0.0  # above 0: the armature plays a second action with fewer keys, within this tolerance
-    colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
-    arrows: bool = False  # velocities as arrows
-    studio: bool = True  # lights, floor and background
-    frame: int | None = None  # of the implicit surface; None: the middle one
-    most_points: int = 300_000  # of the cloud, and of the trajectories, in all frames together; more are thinned evenly
-
-
-DEFAULTS = SceneOptions()
 
 
 @dataclass(frozen=True, kw_only=True)

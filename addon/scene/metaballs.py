@@ -22,7 +22,6 @@ from collections.abc import Iterator
 import bpy
 import numpy as np
 
-from ...core.body.metaball_groups import metaball_groups
 from ...core.body.metaballs import THRESHOLD, Metaballs
 from ...core.body.shape import BodyShape
 from . import nodes
@@ -74,6 +73,8 @@ def _layers(scene: bpy.types.Scene) -> Iterator[bpy.types.LayerCollection]:
 
 def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> list[bpy.types.Object]:
     """For each family a metaball object per bone, child of that bone; a family is polygonised in its first object."""
+    from ...core.body.metaball_groups import metaball_groups
+
     objects = []
     found = metaball_groups(shape)
     for balls in found:

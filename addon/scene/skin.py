@@ -19,10 +19,10 @@ from ...core.body.fields import EXPONENTIAL, Potential
 from ...core.body.metaballs import THRESHOLD
 from ...core.body.shape import BodyShape, read_body
 from ...core.body.skeleton import bone_frames
-from ...core.body.skin.closed_skin import DETAIL, OneSkin
+from ...core.body.skin.closed_skin import OneSkin
 from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.extremities import shape_for_skin
-from ...core.body.skin.mesh import SkinSettings, corner_uv
+from ...core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from ...core.body.skin.person_skin import REST, read_skin, resampled, rest_skin
 from ...core.body.skin.posed import Poser
 from ...core.body.skin.whole_surface import field_grid

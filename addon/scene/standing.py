@@ -17,7 +17,6 @@ import numpy as np
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import bone_frames
-from ...core.motion.floor import floor_height
 from ..session import get_session
 
 ROOT = "root"
@@ -63,6 +62,8 @@ def standing(
     _, head_m = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dof_names)))
     lowest = float(skin_m[:, 2].min())
     ankle = float(np.mean([head_m[bones[foot], 2] for foot in FEET]))
+    from ...core.motion.floor import floor_height
+
     found = floor_m if floor_m is not None else floor_height(shape, values, frames, fps, ankle - lowest)
     return Standing(lift_m=-lowest, floor_m=0.0 if found is None else found)
 

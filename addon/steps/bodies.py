@@ -8,7 +8,6 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from ...core.images.interlace import BOTH
-from ...core.run.stages import STAGE_INPUTS
 from .. import clicks, project, properties
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
@@ -263,6 +262,8 @@ def _where(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def _settings(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
     """All settings of a step's groups, from their definitions in core."""
+    from ...core.run.stages import STAGE_INPUTS
+
     for group in STAGE_INPUTS[states.STAGE[step]].settings:
         header, inside = layout.panel(f"tricap_group_{group}", default_closed=True)
         header.label(text=group.capitalize())

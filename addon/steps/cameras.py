@@ -15,7 +15,6 @@ from .. import folders, project
 from ..calibrate.cameras import rig_of_scene
 from ..operators.build_scene import show_so_far
 from ..scene import clips
-from ..scene.contents import Contents
 from .footage import SimpleOperator
 
 
@@ -55,6 +54,8 @@ class CamerasFromScene(SimpleOperator, bpy.types.Operator):
 
 def show_cameras(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
     """Put the project's cameras with their footage into the viewport, unless a body is there."""
+    from ..scene.contents import Contents
+
     footage = open_take(project.take(context.scene))
     contents = Contents(out=folders.output_folder("", context.scene), run={"take": str(footage.take.folder)}, footage=footage)
     show_so_far(operator, context, contents)

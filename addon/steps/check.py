@@ -19,8 +19,6 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.geometry.rig import read_rig, renamed
 from ...core.images.interlace import BOTH
-from ...core.run.check import check_take
-from ...core.run.stages import STAGE_INPUTS
 from ...core.take.bar_file import read_bar
 from .. import project, properties
 from ..jobs import JobOperator
@@ -73,6 +71,8 @@ def in_panel(checked: Checked, mends: Mends) -> list[str]:
 
 def _named_setting(option: re.Match[str]) -> str:
     """An option of the command, `--set matching.patch_px=21`, as the panel shows it: Patch [px] 21 (step 4 Surface)."""
+    from ...core.run.stages import STAGE_INPUTS
+
     group, name, value = option.groups()
     knob = next(field for field in dataclasses.fields(properties.stages()[group]) if field.name == name)
     step = next((step for step, stage in states.STAGE.items() if group in STAGE_INPUTS[stage].settings), "")
@@ -98,6 +98,8 @@ class Check(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Checked]:
         """The project with the scene's current values."""
+        from ...core.run.check import check_take
+
         folder: Path = project.chosen(context.scene, "", "")[0]
         return lambda monitor: check_take(folder, monitor)
 

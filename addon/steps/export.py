@@ -11,7 +11,6 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from .. import folders
 from ..jobs import JobOperator
-from ..retarget.by_blender import export_motion
 from ..retarget.export import BY_BLENDER, export_file, export_played, named_for
 from ..retarget.operators import armature_of
 from ..retarget.programs import PROGRAMS
@@ -110,6 +109,8 @@ class Export(JobOperator, bpy.types.Operator):
         if self._armature is not None:
             result = export_played(self._armature, self.kind, self._file, self.preset, Monitor())
         elif isinstance(result, Motion):
+            from ..retarget.by_blender import export_motion
+
             result = export_motion(self.kind, self._out, self._file, PROGRAMS[self.preset], result)
         context.scene.tricap_retarget.last_export = f"Exported {self._file.name}: {result}."
         self.report({"INFO"}, f"{self._file}: {result}")

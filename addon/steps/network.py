@@ -2,16 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
-from ...core.run.network_joints import NetworkJoints, joints_by_network, open_network, write_network_joints
 from ...core.take.footage import open_take
 from ...core.take.take import read_take
 from .. import folders, project
 from ..jobs import JobOperator
+
+if TYPE_CHECKING:
+    from ...core.run.network_joints import NetworkJoints
 
 
 class FindJointsWithNetwork(JobOperator, bpy.types.Operator):
@@ -38,8 +41,10 @@ class FindJointsWithNetwork(JobOperator, bpy.types.Operator):
         """Compute here and now, or after the file browser on a thread."""
         return super().invoke(context, None) if self.chosen else super().execute(context)
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], NetworkJoints]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], NetworkJoints]":
         """The project with the scene's current values, and the network's file."""
+        from ...core.run.network_joints import joints_by_network, open_network
+
         if not self.filepath:
             raise InputError("Choose the network's .onnx file.")
         if not project.bound(context.scene):
@@ -48,8 +53,10 @@ class FindJointsWithNetwork(JobOperator, bpy.types.Operator):
         folder: Path = project.chosen(context.scene, "", "")[0]
         return lambda monitor: joints_by_network(open_take(read_take(folder)), open_network(network, monitor), monitor)
 
-    def finish(self, context: bpy.types.Context, result: NetworkJoints) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "NetworkJoints") -> set[str]:
         """Write them into the project as [[keypoints]]."""
+        from ...core.run.network_joints import write_network_joints
+
         folder = project.write(context.scene)
         write_network_joints(folder, result)
         project.remember(context.scene, folder)

@@ -13,21 +13,19 @@ import bpy
 
 from ...core.body.model_file import read_model
 from ...core.body.motion import GUESSED, INFERRED
-from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
 from ...core.fitting.settings import START_ALONE
 from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import ImageSequence, open_sequence
 from ...core.results.run_json import read_run
-from ...core.run.stages import stage_keys
-from ...core.run.take_run import settings_of
+from ...core.run.settings import settings_of
 from ...core.take.clicked_points import clicked_depth
 from ...core.take.footage import Footage, footage_frames, open_take
 from ...core.take.take import Take
 from .. import folders, project
 from ..clicking.click_session import joints_of as joints_in_order
-from ..scene.build import KEYS_KEY, OUT_KEY
+from ..scene.options import KEYS_KEY, OUT_KEY
 from ..session import get_session
 
 STEPS = ("footage", "cameras", "clicks", "surface", "tracks", "body", "rig", "retarget")
@@ -281,6 +279,8 @@ _READY = {
 
 def _figures(step: str, entry: Mapping[str, Any]) -> str:
     if step == "surface":
+        from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
+
         doubt = " Rays miss each other by {:.1f} px: check the cameras, the offsets, and whether views are swapped."
         missed = doubt.format(entry["residual_px"]) if entry["residual_px"] > DOUBTFUL_RESIDUAL_PX else ""
         return f"{entry['points_per_frame']:.0f} points per frame, accurate to {entry['sigma_mm']:.2f} mm (1 sigma).{missed}"
@@ -348,6 +348,8 @@ def joints_of(model: str) -> tuple[str, ...]:
 def _keys(found: _Project) -> Mapping[str, str] | None:
     if found.footage is None or found.take is None or found.out is None:
         return None
+    from ...core.run.stages import stage_keys
+
     return stage_keys(found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 

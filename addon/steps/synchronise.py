@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
-from ...core.synchronising.synchronise import ViewTiming, synchronise
 from ...core.take.take import read_take
 from .. import project
 from ..jobs import JobOperator
-from ..movie_sound import movie_sound
+
+if TYPE_CHECKING:
+    from ...core.synchronising.synchronise import ViewTiming
 
 
 class Synchronise(JobOperator, bpy.types.Operator):
@@ -23,11 +25,14 @@ class Synchronise(JobOperator, bpy.types.Operator):
     step = "footage"
     if_stopped = "Nothing was changed."
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[ViewTiming, ...]]:
+    def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[ViewTiming, ...]]":
         """The project with the scene's current values."""
+        from ...core.synchronising.synchronise import synchronise
+        from ..movie_sound import movie_sound
+
         folder: Path = project.chosen(context.scene, "", "")[0]
 
-        def found(monitor: Monitor) -> tuple[ViewTiming, ...]:
+        def found(monitor: Monitor) -> "tuple[ViewTiming, ...]":
             timings = synchronise(read_take(folder), monitor, movie_sound)
             if lost := [str(timing) for timing in timings if not timing.found]:
                 raise InputError(" ".join(lost))
@@ -35,7 +40,7 @@ class Synchronise(JobOperator, bpy.types.Operator):
 
         return found
 
-    def finish(self, context: bpy.types.Context, result: tuple[ViewTiming, ...]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: "tuple[ViewTiming, ...]") -> set[str]:
         """Set the starts of the views."""
         of_view = {timing.view: timing for timing in result}
         for view in context.scene.tricap.views:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import cv2
 from threadpoolctl import threadpool_limits
 
 from ..foundation.errors import InputError, sentence_of
@@ -30,6 +29,8 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     parser = build_parser(adders)
     args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
     args.parser = parser
+    import cv2
+
     _prepare_libraries()
     monitor = Monitor()
     if not args.quiet:
@@ -76,6 +77,8 @@ def _interrupts(monitor: Monitor) -> Iterator[None]:
 def _prepare_libraries() -> None:
     """For libraries that the command loads later: one thread in linear algebra (see foundation/threads.py), and no messages of the
     video decoders, because a broken file is reported in one sentence of ours."""
+    import cv2
+
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     getattr(cv2.utils, "logging", cv2).setLogLevel(0)  # OpenCV 5, OpenCV 4

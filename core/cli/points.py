@@ -14,6 +14,7 @@ from ..report.pictures import png
 from ..report.point_pictures import paths_in_space, paths_over_footage
 from ..results.folder import Results, check_separate_folder
 from ..run import take_run
+from ..run.settings import settings_of
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from ..tracking.key_points import KeyPoints, track_key_points
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: the arguments, the points or the footage have an error.
     """
     take = read_take(args.take)
-    settings = take_run.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
+    settings = settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), frame_range(args.frames)
     check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
     for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):

@@ -11,6 +11,7 @@ from ..report.film import write_film
 from ..results.folder import check_separate_folder
 from ..run import pipeline, take_run
 from ..run.engine import Engine, of_this_machine
+from ..run.settings import settings_of
 from ..surface.resolution import measured_footage
 from ..surface.starts import MeasureSettings, first_seeds
 from ..synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
@@ -26,7 +27,7 @@ MOST_ASKED = 1000  # workers
 def seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """The surface seeds of one frame."""
     take = read_take(args.take)
-    settings = take_run.settings_of(take.settings, overrides(args.set), str(args.take))
+    settings = settings_of(take.settings, overrides(args.set), str(args.take))
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
     measured = measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
@@ -83,7 +84,7 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Make the synthetic arm, run all stages, and compare with the truth. Settings of the group `sample` are those of the recording."""
     take, out, given = args.out / "take", args.out, overrides(args.set)
     sample: ArmTakeSettings = from_table(ArmTakeSettings, given.pop("sample", {}), "[sample]")
-    take_run.settings_of({}, given, "")
+    settings_of({}, given, "")
     check_separate_folder(out)
     if not is_arm_take(take, sample):
         make_arm_take(take, sample, monitor)

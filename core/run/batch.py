@@ -28,6 +28,7 @@ from ..foundation.progress import Monitor
 from ..results.folder import check_inside, check_separate_folder
 from . import pipeline, take_run
 from .engine import Engine, dask_client
+from .settings import Overrides
 
 FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # of the workers' progress reports
@@ -58,7 +59,7 @@ class Outcome:
 
 
 def run_batch(
-    takes: Sequence[Path], folder: Path, engine: Engine, overrides: take_run.Overrides, monitor: Monitor, *, restart: bool = False
+    takes: Sequence[Path], folder: Path, engine: Engine, overrides: Overrides, monitor: Monitor, *, restart: bool = False
 ) -> list[Outcome]:
     """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each.
 
@@ -103,7 +104,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def run_take(take: str, out: str, overrides: take_run.Overrides, restart: bool) -> dict[str, Any]:
+def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[str, Any]:
     """The task of a worker: run one take like `tricap run`. Returns an Outcome as a table; the task fails only if the worker dies."""
     began = time.perf_counter()
     try:

@@ -8,7 +8,7 @@ from ..checking.findings import Cause, Checked, wrong
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..take.take import read_take
-from .take_run import settings_of
+from .settings import settings_of
 
 
 def check_take(folder: Path, monitor: Monitor) -> Checked:

@@ -20,7 +20,8 @@ from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page
 from ..results.folder import Results, check_separate_folder
 from . import pipeline
-from .take_run import Overrides, open_run
+from .settings import Overrides
+from .take_run import open_run
 
 PLACE_M = 0.02  # edge of the cubes in which coverage is counted
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise

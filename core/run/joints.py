@@ -22,7 +22,8 @@ from ..surface.starts import MeasureSettings
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from ..take.writing import read_table, write_table
-from .take_run import Overrides, only_frames, settings_of
+from .settings import Overrides, settings_of
+from .take_run import only_frames
 
 PLACES, SHORTLY_S = 3, 0.2  # in the recording, where a frame is measured and another one shortly afterwards
 CLICKED = ("pelvis", "neck", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # what people click

@@ -48,8 +48,9 @@ from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
+from .settings import Overrides
 from .stages import STAGES
-from .take_run import Overrides, Run, open_run
+from .take_run import Run, open_run
 from .workers import measure_at_once
 
 BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin")  # of the fit, besides the report

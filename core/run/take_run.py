@@ -9,48 +9,24 @@ from typing import Any
 
 from ..body.model_file import read_model
 from ..body.motion import BodyFit
-from ..body.skin.contour_skin import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
-from ..fitting.settings import FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
-from ..foundation.settings import current_tables, from_table
-from ..images.enhance import EnhanceSettings
-from ..images.retime import TimingSettings
-from ..matching.least_squares import MatchingSettings
-from ..matching.region_growing import GrowingSettings
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
 from ..results.folder import Results, check_separate_folder
-from ..surface.cloud import PointCloud, SurfaceSettings
+from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
 from ..surface.resolution import measured_footage
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
-from ..tracking.contour import ContourSettings
 from ..tracking.corrections import corrected_cloud
-from ..tracking.settings import KeyPointSettings, TrackingSettings
 from ..tracking.trajectories import Trajectories
 from .engine import Engine
-from .presets import PRESETS, MethodSettings
 from .record import frame_table, new_record, write_frame_table
+from .settings import Overrides, settings_of
 from .stages import STAGE_FILES, STAGE_INPUTS, stage_keys, valid_stages
-
-SETTINGS: dict[str, type] = {
-    "method": MethodSettings,
-    "timing": TimingSettings,
-    "enhance": EnhanceSettings,
-    "matching": MatchingSettings,
-    "growing": GrowingSettings,
-    "surface": SurfaceSettings,
-    "tracking": TrackingSettings,
-    "key_points": KeyPointSettings,
-    "contour": ContourSettings,
-    "fitting": FitSettings,
-    "skin": SkinSettings,
-}
-Overrides = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(kw_only=True)
@@ -125,21 +101,6 @@ class Run:
         if "fit" in stages and "not_done" not in stages["fit"]:
             parts.append("body fitted")
         return ", ".join(parts)
-
-
-def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> dict[str, Any]:
-    """All settings of a run: the defaults, then those of the preset, then take.toml's, then the command's or the panel's.
-
-    Raises:
-        InputError: an unknown table or name, or a value that cannot be.
-    """
-    given: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
-    for source, place in ((take_settings, f" in {where}"), (overrides, "")):
-        for name, table in current_tables(source, SETTINGS, place).items():
-            given[name].update(table)
-    method: MethodSettings = from_table(MethodSettings, given["method"], "[method]")
-    preset = PRESETS[method.preset]
-    return {name: from_table(cls, {**preset.get(name, {}), **given[name]}, f"[{name}]") for name, cls in SETTINGS.items()}
 
 
 @contextmanager

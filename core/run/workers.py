@@ -27,7 +27,8 @@ from ..surface.starts import FrameStarts, MeasureSettings
 from ..take.footage import open_take
 from ..take.take import read_take
 from .engine import Engine, dask_client, python_command, thread_limits
-from .take_run import SETTINGS, Run, only_frames
+from .settings import SETTINGS
+from .take_run import Run, only_frames
 
 PIECE = 4  # frames of a task
 WAIT_S = 0.2  # between two looks at the workers

@@ -1,13 +1,12 @@
 """Load Sample and Run: offline, beside the .blend or among the extension's files, and the same numbers as the command line's."""
 
-import dataclasses
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from tricap.core.run import pipeline
-from tricap.core.synthetic.arm import make_arm_take
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.score import score_run
 
 
@@ -17,7 +16,7 @@ def small(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     from bl_ext.user_default.tricap.addon.operators import run
 
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    monkeypatch.setattr(run, "SAMPLE", dataclasses.replace(run.SAMPLE, frames=4, width_px=256))
+    monkeypatch.setattr(run, "SAMPLE", {**run.SAMPLE, "frames": 4, "width_px": 256})
     return run
 
 
@@ -27,7 +26,7 @@ def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: M
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
     out = folder / "tricap_sample" / "results"
-    make_arm_take(tmp_path / "sample", small.SAMPLE)
+    make_arm_take(tmp_path / "sample", ArmTakeSettings(**small.SAMPLE))
     pipeline.run(tmp_path / "sample", tmp_path / "out")
     assert (out / "motion.csv").read_bytes() == (tmp_path / "out" / "motion.csv").read_bytes()
     scene = blender.context.scene
@@ -39,7 +38,9 @@ def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: M
 
 
 def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, small: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(small.pipeline, "all_stages", small.pipeline.measure)  # it is the place that matters
+    from bl_ext.user_default.tricap.core.run import pipeline
+
+    monkeypatch.setattr(pipeline, "all_stages", pipeline.measure)  # it is the place that matters
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
     place = Path(blender.utils.extension_path_user("bl_ext.user_default.tricap"))
     assert Path(blender.context.scene.tricap.take) == place / "tricap_sample"
@@ -56,7 +57,7 @@ def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleT
 
 
 def test_a_file_with_footage_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
-    make_arm_take(tmp_path / "mine", small.SAMPLE)
+    make_arm_take(tmp_path / "mine", ArmTakeSettings(**small.SAMPLE))
     from bl_ext.user_default.tricap.addon import project
 
     project.open_take(blender.context.scene, tmp_path / "mine")

@@ -37,14 +37,14 @@ def test_the_operator_gives_the_commands_numbers_and_a_scene(blender: ModuleType
 def test_a_run_of_all_steps_reports_its_warnings(
     blender: ModuleType, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    from bl_ext.user_default.tricap.addon.operators import run
+    from bl_ext.user_default.tricap.core.run import pipeline
 
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
     def warned(report: Any, monitor: Any) -> None:
         report.warn("The rays miss each other by 9 px.")
 
-    monkeypatch.setattr(run.pipeline, "all_stages", warned)
+    monkeypatch.setattr(pipeline, "all_stages", warned)
     assert blender.ops.tricap.run(take=str(take), out=str(tmp_path / "out"), build=False) == {"FINISHED"}
     assert "Warning: The rays miss each other by 9 px." in capfd.readouterr().out.splitlines()
 

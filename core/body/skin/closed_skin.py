@@ -164,7 +164,6 @@ def _most_frequent(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.take_along_axis(ordered, times.argmax(axis=1)[:, None], axis=1)[:, 0])
 
 
-DETAIL = 2  # of a scene: at 32 rays the quads are 0.15 to 0.25 mm RMS from the surface, with 1 they are 0.7, being flat
 SEAM_RINGS = 4  # quads on either side of a seam that are relaxed
 SPARSE_M = 0.005  # quads whose middle is farther from the surface are relaxed, too
 RELAXING_STEPS = 40

@@ -23,6 +23,7 @@ from ...foundation.arrays import frozen
 from ...foundation.settings import knob
 
 INTERPOLATING, APPROXIMATING = "interpolating", "approximating"
+DETAIL = 2  # of a scene: at 32 rays the quads are 0.15 to 0.25 mm RMS from the surface, with 1 they are 0.7, being flat
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

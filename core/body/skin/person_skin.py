@@ -15,10 +15,10 @@ from ...foundation import store
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ..shape import BodyShape
-from .closed_skin import DETAIL, OneSkin, one_skin, unflipped
+from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
 from .fairing import anatomical, faired
-from .mesh import SkinSettings, chain_faces, chains_uv
+from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
 from .relief import SurfacePoints, measured_relief
 from .surface_operators import vertex_normals

@@ -10,10 +10,10 @@ import pytest
 from tricap.core.body import model_file
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
-from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, one_skin, seam_jumps
+from tricap.core.body.skin.closed_skin import OneSkin, flipped, one_skin, seam_jumps
 from tricap.core.body.skin.contour_skin import MOST_BONES, body_skin, hinge, strongest
 from tricap.core.body.skin.extremities import person_shape
-from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.mesh import DETAIL, SkinSettings
 from tricap.core.body.skin.whole_surface import WholeSurface
 
 

@@ -10,10 +10,10 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, mean_of_neighbours
+from tricap.core.body.skin.closed_skin import OneSkin, flipped, mean_of_neighbours
 from tricap.core.body.skin.contour_skin import body_skin
 from tricap.core.body.skin.fairing import faired
-from tricap.core.body.skin.mesh import SkinSettings, corner_uv
+from tricap.core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from tricap.core.body.skin.person_skin import REST, cage, read_skin, resampled, rest_skin, with_relief, write_skin
 from tricap.core.body.skin.posed import Poser
 from tricap.core.body.skin.relief import PRIOR_M, SurfacePoints

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tricap.addon import command
 from tricap.addon.retarget import command as retargeting
 from tricap.addon.retarget.programs import PROGRAMS
-from tricap.core.body.skin.closed_skin import DETAIL
 from tricap.core.calibration.boards.board import BoardKind
 from tricap.core.calibration.rig_files import FORMATS
 from tricap.core.cli import parser
@@ -57,6 +55,5 @@ def test_the_parser_knows_what_it_does_not_import() -> None:
     assert parser.RIG_FORMATS == tuple(sorted(FORMATS))
     assert parser.RETRIES == RETRIES
     assert parser.BOARDS == tuple(BoardKind)
-    assert command.DETAIL == DETAIL
     assert retargeting.UNITS == tuple(UNITS_M)
     assert retargeting.PROGRAM_NAMES == tuple(PROGRAMS)

@@ -14,6 +14,7 @@ from tricap.core.cli import contour, points
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.settings import from_table, knob, nearest_name, to_table
 from tricap.core.run import pipeline, take_run
+from tricap.core.run import settings as run_settings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,9 +75,9 @@ def test_what_is_refused(table: dict, said: str) -> None:
     assert "\n" not in str(error.value) and len(str(error.value)) < 250
 
 
-@pytest.mark.parametrize("group", sorted(take_run.SETTINGS))
+@pytest.mark.parametrize("group", sorted(run_settings.SETTINGS))
 def test_every_knob_says_what_it_is_and_lies_within_its_limits(group: str) -> None:
-    cls = take_run.SETTINGS[group]
+    cls = run_settings.SETTINGS[group]
     for field in dataclasses.fields(cls):
         about = field.metadata["about"]
         assert about.endswith(".") and about[0].isupper(), field.name
@@ -144,13 +145,13 @@ def unread_knobs(group: str, cls: type, reads: Reads) -> list[str]:
 READ_BY = {"contour": contour, "key_points": points}  # the others by the run
 
 
-@pytest.mark.parametrize("group", sorted(take_run.SETTINGS))
+@pytest.mark.parametrize("group", sorted(run_settings.SETTINGS))
 def test_every_knob_is_read_by_what_it_belongs_to(group: str) -> None:
-    assert not unread_knobs(group, take_run.SETTINGS[group], reads_of(READ_BY.get(group, pipeline)))
+    assert not unread_knobs(group, run_settings.SETTINGS[group], reads_of(READ_BY.get(group, pipeline)))
 
 
 def test_a_knob_that_nothing_reads_is_reported() -> None:
     """One that is only defined, set, or read from something else; and one that the run does not read, though a command does."""
     source = "def f(settings, sample, link):\n    settings.sigma = link.text = 1\n    return settings.patch_px, sample.way, link.correct"
     assert unread_knobs("sample", Sample, reads_in(source)) == ["sigma", "free", "correct", "text"]
-    assert unread_knobs("key_points", take_run.SETTINGS["key_points"], reads_of(pipeline)) == ["markers"]
+    assert unread_knobs("key_points", run_settings.SETTINGS["key_points"], reads_of(pipeline)) == ["markers"]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tricap.core.foundation import store
+from tricap.core.run import settings as run_settings
 from tricap.core.run import take_run
 from tricap.core.run.stages import STAGE_INPUTS, STAGES, WITHOUT_STAGE, stage_keys, stage_of, valid_stages
 from tricap.core.take.footage import open_take
@@ -69,11 +70,11 @@ def test_a_change_concerns_its_stage_and_those_after_it(take: Path, first: str, 
 
 def other_than_default(group: str) -> dict[str, Any]:
     """One knob of the group, changed."""
-    for name, knob in take_run.SETTINGS[group].__dataclass_fields__.items():
+    for name, knob in run_settings.SETTINGS[group].__dataclass_fields__.items():
         high = knob.metadata["high"]
         if not isinstance(knob.default, (str, bool)) and high is not None and high > knob.default:
             return {name: high}
-    for name, knob in take_run.SETTINGS[group].__dataclass_fields__.items():
+    for name, knob in run_settings.SETTINGS[group].__dataclass_fields__.items():
         if isinstance(knob.default, bool):
             return {name: not knob.default}
     raise AssertionError(group)
@@ -135,7 +136,7 @@ def test_keypoints_concern_the_fit(take: Path, tmp_path: Path) -> None:
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
     groups = [name for concern in STAGE_INPUTS.values() for name in concern.settings]
-    assert sorted([*groups, *WITHOUT_STAGE]) == sorted(take_run.SETTINGS) and stage_of("tracking") == "track"
+    assert sorted([*groups, *WITHOUT_STAGE]) == sorted(run_settings.SETTINGS) and stage_of("tracking") == "track"
 
 
 @pytest.mark.parametrize("group", ["contour", "key_points"])

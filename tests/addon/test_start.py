@@ -1,0 +1,55 @@
+"""Enabling the add-on loads neither stages nor builders nor scipy, and takes little time (CPU seconds, the lowest of three starts)."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed for this Python")
+CODE = """
+import sys, time, bpy, tricap
+before, began = set(sys.modules), time.process_time()
+tricap.register()
+if "work" in sys.argv:
+    from tricap.core.run import pipeline
+print(time.process_time() - began, *(set(sys.modules) - before))"""
+HEAVY = {
+    "scipy",
+    "tricap.addon.scene.build",
+    "tricap.addon.scene.contents",
+    "tricap.core.calibration.calibrate",
+    "tricap.core.checking.take_check",
+    "tricap.core.cli.main",
+    "tricap.core.fitting.stages.sequence",
+    "tricap.core.report.pages",
+    "tricap.core.run.pipeline",
+    "tricap.core.run.record",
+    "tricap.core.run.take_run",
+    "tricap.core.surface.measure",
+    "tricap.core.synchronising.synchronise",
+    "tricap.core.tracking.track",
+}
+LIMIT_S = 0.4  # twice what it takes on an idle machine, with the bytecode that the first start wrote
+
+
+def start(bytecode: Path, *arguments: str) -> tuple[float, set[str]]:
+    """The CPU time [s] of registering in a new process, and the modules that it loads."""
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    variables["PYTHONPYCACHEPREFIX"] = str(bytecode)
+    done = subprocess.run([sys.executable, "-c", CODE, *arguments], capture_output=True, text=True, check=True, env=variables)
+    seconds, *modules = done.stdout.splitlines()[-1].split()
+    return float(seconds), set(modules)
+
+
+def test_enabling_loads_no_stage_and_is_quick(tmp_path: Path) -> None:
+    _, modules = start(tmp_path)
+    assert "tricap.core.run.settings" in modules
+    assert not modules & HEAVY
+    assert min(start(tmp_path)[0] for _ in range(3)) < LIMIT_S
+
+
+def test_a_loaded_stage_is_found_out(tmp_path: Path) -> None:
+    assert {"tricap.core.run.pipeline", "tricap.core.run.record", "tricap.core.tracking.track"} <= start(tmp_path, "work")[1]
