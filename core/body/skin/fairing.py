@@ -15,7 +15,7 @@ import numpy as np
 
 from ..shape import BodyShape
 from .extremities import TABLES
-from .surface_operators import laplacian, vertex_normals
+from .surface_operators import factorised, laplacian, vertex_normals
 
 CURVATURE_M = 0.05  # ℓ of (1)
 WIDTH_M = 0.09  # w of (2): waves shorter than some 2π w vanish if the smoothed curvature has none
@@ -32,7 +32,6 @@ def anatomical(shape: BodyShape, weights: np.ndarray) -> np.ndarray:
 def faired(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) of the fair surface; `kept` (V,) 0 to 1: to what degree each keeps its place.  (1), (2)"""
     from scipy import sparse
-    from scipy.sparse.linalg import splu
 
     found = vertices
     tie = np.exp((1 - kept) * np.log(WIDTH_M) + kept * np.log(ANATOMICAL_M)) ** -4
@@ -40,9 +39,9 @@ def faired(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> np.ndar
         C, area = laplacian(found, faces)
         M, normals = sparse.diags(area), vertex_normals(found, faces)
         h = np.einsum("vk,vk->v", normals, C @ found) / area
-        smooth = splu(sparse.csc_matrix(M - CURVATURE_M**2 * C), permc_spec="MMD_AT_PLUS_A").solve(area * h)
+        smooth = factorised(M - CURVATURE_M**2 * C).solve(area * h)
         wanted = kept[:, None] * (C @ found) / area[:, None] + ((1 - kept) * smooth)[:, None] * normals
-        normal = sparse.csc_matrix(C.T @ sparse.diags(1 / area) @ C + sparse.diags(tie * area))
+        normal = C.T @ sparse.diags(1 / area) @ C
         right = C.T @ wanted + (tie * area)[:, None] * vertices
-        found = splu(normal, permc_spec="MMD_AT_PLUS_A").solve(right)
+        found = factorised(normal, tie * area).solve(right)
     return np.asarray(found)

@@ -21,17 +21,19 @@ its diagonal is estimated from samples A⁻¹(Bᵀε) of it (Papandreou & Yuille
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...foundation.arrays import frozen
 from ...foundation.progress import Monitor
+from ...foundation.threads import in_threads
 from ...geometry.robust import TUKEY, mad_sigma
 from ..shape import BodyShape
 from .closed_skin import OneSkin
 from .posed import Poser
-from .surface_operators import laplacian, vertex_normals
+from .surface_operators import factorised, laplacian, vertex_normals
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -48,6 +50,7 @@ CORRELATED = 3.0  # c of (3)
 NEARBY_M = 0.03  # over which σ_f is averaged
 MOST_FRAMES = 80  # evenly over the take
 ROUNDS = (12, MOST_FRAMES)  # frames, evenly, of each round of finding the points' vertices
+TOGETHER = 8  # frames between two reports of progress
 REWEIGHTINGS = (0, 2)  # in each round
 SAMPLES = 32  # of the covariance: each sigma to 12 %
 UNMEASURED = 0.7  # of s: the sigma above which a vertex was hardly measured
@@ -96,19 +99,19 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
     delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
-        moved, found = skin.vertices_m + delta[:, None] * normals, []
+        moved, found = skin.vertices_m + delta[:, None] * normals, list[_Observed]()
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-        for i, row in enumerate(chosen):
+        observed = partial(_observed, poser, moved, skin.faces, delta, GATE * size)
+        for i in range(0, len(chosen), TOGETHER):
             monitor.step("relief", done * len(chosen) + i, len(ROUNDS) * len(chosen) + 1)
-            posed = poser.posed(moved, frames[row].motion)
-            found.append(_observed(posed, skin.faces, delta, frames[row], GATE * size))
+            found += in_threads(observed, [frames[row] for row in chosen[i : i + TOGETHER]])
         seen = _Observed(**{name: np.concatenate([getattr(f, name) for f in found]) for name in _Observed.__slots__})
         delta, factor, weight = _adjusted(prior, nearby, seen, reweightings)
     sigma = _sigmas(factor, prior, seen, weight)
     if mirror:
         seen, weight = _mirrored(skin.vertices_m, normals, delta, sigma, size, seen, weight)
         total, right = (np.bincount(seen.vertex, w, len(delta)) for w in (weight, weight * seen.d))
-        factor = _factorised(prior.T @ prior, total)
+        factor = factorised(prior.T @ prior, total)
         delta, sigma = factor.solve(right), _sigmas(factor, prior, seen, weight)
     return Relief(displacement_m=delta, sigma_m=sigma)
 
@@ -120,7 +123,7 @@ class _Nearby:
         from scipy import sparse
 
         C, area = laplacian(vertices, faces)
-        self._factor, self._count = _factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area)
+        self._factor, self._count = factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area)
 
     def scatter(self, vertex: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """σ_f (V,) of (3) from residuals (M,) at vertices (M,), none of which counts more than GATE times their standard deviation."""
@@ -145,10 +148,11 @@ def _prior(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray) -> "sparse
     return sparse.csc_matrix(sparse.diags(scale) @ (KAPPA**2 * sparse.diags(area) - C))
 
 
-def _observed(posed: np.ndarray, faces: np.ndarray, delta: np.ndarray, points: SurfacePoints, gate: np.ndarray) -> _Observed:
-    """(1) of one frame, averaged for every vertex; `delta` (V,) is the displacement that `posed` has, `gate` (V,) the largest."""
+def _observed(poser: Poser, moved: np.ndarray, faces: np.ndarray, delta: np.ndarray, gate: np.ndarray, points: SurfacePoints) -> _Observed:
+    """(1) of one frame, averaged for every vertex; `delta` (V,) is the displacement that the skin `moved` has, `gate` (V,) the largest."""
     from scipy.spatial import cKDTree
 
+    posed = poser.posed(moved, points.motion)
     normals = vertex_normals(posed, faces)
     X, m = points.xyz_m, points.normals
     distance, near = cKDTree(posed).query(X, k=CANDIDATES, distance_upper_bound=float(gate.max()))
@@ -173,21 +177,12 @@ def _adjusted(prior: "sparse.csc_matrix", nearby: "_Nearby", seen: _Observed, re
     delta, factor, weight = np.zeros(count), None, robust
     for _ in range(1 + reweightings):
         weight = robust / (seen.variance + (CORRELATED * spread) ** 2)
-        factor = _factorised(prior.T @ prior, np.bincount(seen.vertex, weight, count))
+        factor = factorised(prior.T @ prior, np.bincount(seen.vertex, weight, count))
         delta = factor.solve(np.bincount(seen.vertex, weight * seen.d, count))
         residual = seen.d - delta[seen.vertex]
         spread = nearby.scatter(seen.vertex, residual)[seen.vertex]  # (3)
         robust = np.clip(1 - (residual / (TUKEY * np.sqrt(seen.variance + spread**2))) ** 2, 0, None) ** 2
     return delta, factor, weight
-
-
-def _factorised(matrix: "sparse.spmatrix", weight: np.ndarray | None = None) -> Any:
-    """The factors of a symmetric matrix (V, V) with `weight` (V,) added to its diagonal."""
-    from scipy import sparse
-    from scipy.sparse.linalg import splu
-
-    whole = matrix if weight is None else matrix + sparse.diags(weight.astype(np.float64))
-    return splu(sparse.csc_matrix(whole), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
 
 def _mirrored(

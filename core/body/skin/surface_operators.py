@@ -1,4 +1,4 @@
-"""Differential operators on a mesh of quads: vertex normals, areas, and the Laplace–Beltrami operator.
+"""Differential operators on a mesh of quads: vertex normals, areas, and the Laplace–Beltrami operator; and the solution of their equations.
 
     (C f)_i = ½ Σ_j (cot α_ij + cot β_ij)(f_j − f_i) ,   Δf = M⁻¹ C f ,   M: the vertices' areas             (1)
 
@@ -6,7 +6,7 @@
 corners cause, are set to a small positive one, so that the maximum principle holds.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -48,3 +48,12 @@ def laplacian(vertices: np.ndarray, faces: np.ndarray) -> "tuple[sparse.csr_matr
     W = sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (count, count))
     C = sparse.csr_matrix(W - sparse.diags(np.asarray(W.sum(axis=1)).ravel()))
     return C, np.maximum(area, LEAST_AREA_M2)
+
+
+def factorised(matrix: "sparse.spmatrix", weight: np.ndarray | None = None) -> Any:
+    """The factors of a positive definite matrix (V, V), which needs no pivots, with `weight` (V,) added to its diagonal."""
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    whole = matrix if weight is None else matrix + sparse.diags(weight.astype(np.float64))
+    return splu(sparse.csc_matrix(whole), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

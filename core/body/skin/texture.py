@@ -24,12 +24,13 @@ import numpy as np
 
 from ...foundation import store
 from ...foundation.arrays import frozen
+from ...foundation.threads import in_threads
 from ...geometry.camera import Camera
 from ..shape import BodyShape
 from .closed_skin import OneSkin
 from .person_skin import cage
 from .posed import Poser
-from .surface_operators import laplacian, vertex_normals
+from .surface_operators import factorised, laplacian, vertex_normals
 
 TEXTURE, MASK = "texture.png", "texture_mask.png"  # in the folder skin/
 LEAST_COSINE = 0.3  # between normal and ray
@@ -95,14 +96,25 @@ class TextureBaker:
         posed = self._poser.posed(self._skin.vertices_m, motion)
         normals = vertex_normals(posed, self._skin.faces)
         places, across = self._at(posed), self._at(normals)
-        on_cage = []
-        for v, view in enumerate(views):
+
+        def shown(v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+            view = views[v]
             depth = nearest_depth(view.camera, posed[self._rows], self._cage)
-            rows, xy, size = _visible(view.camera, places, across, depth)
-            self._keep(rows, _sampled(view, xy), (size * self._trust[rows]).astype(np.float32), v)
-            shown, xy, _ = _visible(view.camera, posed[self._rows], normals[self._rows], depth)
+            rows, size = _facing(view.camera, places, across)
+            weight = (size * self._trust[rows]).astype(np.float32)
+            better = weight > self._weight[rows, -1]  # the others need not be looked for
+            rows, weight = rows[better], weight[better]
+            free, xy = _unhidden(view.camera, places[rows], depth)
+            rgb, weight, rows = _sampled(view, xy), weight[free], rows[free]
+            facing, _ = _facing(view.camera, posed[self._rows], normals[self._rows])
+            free, xy = _unhidden(view.camera, posed[self._rows[facing]], depth)
             grey = np.full(len(self._rows), np.nan)
-            grey[shown] = _sampled(view, xy).mean(axis=1)
+            grey[facing[free]] = _sampled(view, xy).mean(axis=1)
+            return rows, rgb, weight, grey
+
+        on_cage = []
+        for v, (rows, rgb, weight, grey) in enumerate(in_threads(shown, range(len(views)))):
+            self._keep(rows, rgb, weight, v)
             on_cage.append(grey)
         for (a, b), found in self._ratios.items():
             both = (on_cage[a] > DARKEST) & (on_cage[b] > DARKEST)
@@ -173,7 +185,6 @@ class TextureBaker:
     def _filled(self, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Colours (N, 3) of all texels from a smooth continuation of those that were seen."""
         from scipy import sparse
-        from scipy.sparse.linalg import splu
 
         C, _ = laplacian(self._skin.vertices_m, self._skin.faces)
         nearest = self._corners[np.arange(len(seen)), self._shares.argmax(axis=1)]
@@ -182,7 +193,7 @@ class TextureBaker:
         middle = colour[seen].mean(axis=0) if seen.any() else np.full(3, 127.0)
         tie = STIFF * (count > 0)
         right = tie[:, None] * total / np.maximum(count, 1)[:, None] + WEAK * middle
-        return self._at(splu(sparse.csc_matrix(sparse.diags(tie + WEAK) - C), permc_spec="MMD_AT_PLUS_A").solve(right))
+        return self._at(factorised(sparse.diags(tie + WEAK) - C).solve(right))
 
 
 def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -205,21 +216,25 @@ def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> 
     return image
 
 
-def _visible(camera: Camera, places: np.ndarray, normals: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows (M,) of places (N, 3) that a view shows, their pixels (M, 2), and (cos ϑ f/z)² of (1)."""
+def _facing(camera: Camera, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows (M,) of places (N, 3) before a camera that face it, and (cos ϑ f/z)² of (1)."""
     ray = camera.centre_m - places
-    distance = np.linalg.norm(ray, axis=1)
+    distance = np.sqrt(np.einsum("nk,nk->n", ray, ray))
     cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(distance, 1e-9)
-    rows = np.flatnonzero(cosine > LEAST_COSINE)
-    xy = camera.project(places[rows])
-    inside = camera.sees(xy, EDGE_PX + 1)
-    rows, xy = rows[inside], xy[inside]
-    pixel = np.rint(xy).astype(np.int64)
+    z = -(ray @ camera.R_cam_world[2])
+    rows = np.flatnonzero((cosine > LEAST_COSINE) & (z > 0))
+    return rows, (cosine[rows] * camera.focal_px / z[rows]) ** 2
+
+
+def _unhidden(camera: Camera, places: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows (M,) of places (N, 3) before a camera that lie inside its image with nothing in front of them, and their pixels (M, 2)."""
+    xy = camera.project(places)
+    rows = np.flatnonzero(camera.sees(xy, EDGE_PX + 1))
+    pixel = np.rint(xy[rows]).astype(np.int64)
     near = cv2.erode(depth, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8))
     z = camera.to_camera(places[rows])[:, 2]
-    free = (z > 0) & (z < near[pixel[:, 1], pixel[:, 0]] + NEARER_M)
-    rows, z = rows[free], z[free]
-    return rows, xy[free], (cosine[rows] * camera.focal_px / z) ** 2
+    rows = rows[z < near[pixel[:, 1], pixel[:, 0]] + NEARER_M]
+    return rows, xy[rows]
 
 
 def _sampled(view: View, xy: np.ndarray) -> np.ndarray:

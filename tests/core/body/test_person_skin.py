@@ -17,7 +17,7 @@ from tricap.core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from tricap.core.body.skin.person_skin import REST, cage, read_skin, resampled, rest_skin, with_relief, write_skin
 from tricap.core.body.skin.posed import Poser
 from tricap.core.body.skin.relief import PRIOR_M, SurfacePoints
-from tricap.core.body.skin.surface_operators import laplacian, vertex_normals
+from tricap.core.body.skin.surface_operators import factorised, laplacian, vertex_normals
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -63,6 +63,14 @@ def test_the_operators_of_a_sphere() -> None:
     assert area.sum() == pytest.approx(4 * np.pi * 0.01, rel=0.005)
     curvature = np.einsum("nk,nk->n", normals, C @ vertices) / area
     assert (curvature * area).sum() / area.sum() == pytest.approx(-20, rel=0.1) and curvature.max() < -19  # −2/r on the whole
+
+
+def test_equations_of_a_mesh_are_solved() -> None:
+    C, area = laplacian(*sphere(0.1))
+    weight = area / 0.05**2
+    wanted = np.random.default_rng(0).normal(size=len(area))
+    right = weight * wanted - C @ wanted
+    assert np.allclose(factorised(-C, weight).solve(right), wanted, rtol=1e-8)
 
 
 def test_fairing_keeps_a_sphere_and_removes_ledges() -> None:
