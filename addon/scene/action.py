@@ -43,7 +43,7 @@ def add_action(
         path = pose_bone.path_from_id()
         key(action, armature_object, f"{path}.{channel}", index, frames, sign * values[:, column] + offset, group=bone_name)
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
-    for bone in armature.rig_bones(shape):
+    for bone in (bone for bone in armature.rig_bones(shape) if bone.dofs):
         _mute_exceeded_limits(armature_object.pose.bones[bone.name], bone, motion)
     return action
 

@@ -16,6 +16,7 @@ from mathutils import Vector
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone, bone_frames
+from ...core.body.skin.fingers import FINGER_BONE
 from ...core.motion.retarget.roles import model_roles
 from .standing import LIFT_KEY, ROOT, Standing, base_height
 
@@ -59,7 +60,7 @@ def add_armature(collection: bpy.types.Collection, shape: BodyShape, stand: Stan
 def _joint_ends(shape: BodyShape) -> dict[str, dict[str, Any]]:
     """By joint, a bone of the armature that begins or ends there."""
     ends: dict[str, dict[str, Any]] = {}
-    for bone in rig_bones(shape):
+    for bone in (bone for bone in rig_bones(shape) if not is_finger(bone)):
         ends.setdefault(bone.head_joint, {"bone": bone.name, "at_tail": False})
         ends.setdefault(bone.tail_joint, {"bone": bone.name, "at_tail": True})
     return {joint: ends[joint] for joint in shape.skeleton.joint_names if joint in ends}
@@ -90,9 +91,14 @@ def channel_of(shape: BodyShape, stand: Standing | None = None) -> dict[str, Cha
 
 def rig_bones(shape: BodyShape) -> list[Bone]:
     """The bones of the skeleton that are bones of the armature: all but rigid connections without flesh (from the nape to the collarbone,
-    half the pelvis), which no rig has."""
+    half the pelvis, from the wrist to the fingers), which no rig has. Fingers, too, have bones, which nothing moves but the animator."""
     skeleton, fleshy = shape.skeleton, set(shape.metaballs.bone_index.tolist())
-    return [bone for b, bone in enumerate(skeleton.bones) if bone.dofs or not bone.parent or b in fleshy]
+    return [bone for b, bone in enumerate(skeleton.bones) if bone.dofs or not bone.parent or b in fleshy or is_finger(bone)]
+
+
+def is_finger(bone: Bone) -> bool:
+    """Whether it is a bone of a finger."""
+    return FINGER_BONE.fullmatch(bone.name) is not None
 
 
 def _edit_bones(armature_object: bpy.types.Object, shape: BodyShape, lift_m: float) -> None:
@@ -141,6 +147,9 @@ def _region(bone: bpy.types.Bone) -> str:
 def _free_rotation(pose_bone: bpy.types.PoseBone, bone: Bone) -> None:
     """Unlock the bone's DOFs; their limits become IK limits and a Limit Rotation constraint."""
     pose_bone.rotation_mode = bone.rotation_mode
+    if is_finger(bone):
+        pose_bone.lock_rotation = (False, False, False)
+        return
     dofs = {dof.axis: dof for dof in bone.dofs}
     limit = pose_bone.constraints.new("LIMIT_ROTATION")
     limit.name, limit.owner_space, limit.euler_order = "Joint limits", "LOCAL", bone.rotation_mode

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...core.body.shape import BodyShape, read_body
 from ...core.body.skin.contour_skin import body_skin
-from ...core.body.skin.extremities import shape_for_skin
+from ...core.body.skin.fingers import shape_for_skin
 from ...core.body.skin.mesh import SkinSettings
 from ...core.body.skin.person_skin import REST
 from ...core.foundation import store

@@ -21,7 +21,7 @@ from ...core.body.shape import BodyShape, read_body
 from ...core.body.skeleton import bone_frames
 from ...core.body.skin.closed_skin import OneSkin
 from ...core.body.skin.contour_skin import body_skin
-from ...core.body.skin.extremities import shape_for_skin
+from ...core.body.skin.fingers import shape_for_skin
 from ...core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from ...core.body.skin.person_skin import REST, read_skin, resampled, rest_skin
 from ...core.body.skin.posed import Poser

@@ -13,7 +13,7 @@ import numpy as np
 from ..body.limb_words import limb_words, sentence
 from ..body.motion import BodyFit
 from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.extremities import shape_for_skin
+from ..body.skin.fingers import shape_for_skin
 from ..body.skin.mesh import Skin
 from ..body.skin.posed import skins_in
 from ..foundation import store

@@ -21,7 +21,7 @@ from ..body.motion import BodyFit
 from ..body.shape import BodyShape
 from ..body.skeleton import Skeleton
 from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.extremities import shape_for_skin
+from ..body.skin.fingers import shape_for_skin
 from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import filled
 from ..foundation.errors import InputError

@@ -13,7 +13,7 @@ from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..body.shape import write_body
 from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
-from ..body.skin.extremities import shape_for_skin
+from ..body.skin.fingers import shape_for_skin
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
 from ..body.skin.posed import Poser

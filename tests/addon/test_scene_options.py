@@ -14,7 +14,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
-from tricap.core.body.skin.extremities import shape_for_skin
+from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
 from tricap.core.body.skin.texture import TEXTURE
 from tricap.core.foundation import store

@@ -11,7 +11,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.closed_skin import OneSkin
-from tricap.core.body.skin.extremities import shape_for_skin
+from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
 from tricap.core.foundation import store

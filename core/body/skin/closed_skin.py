@@ -31,8 +31,9 @@ from ...foundation.arrays import frozen
 from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
+from .hands import caged, rounded
 from .mesh import SkinSettings, corner_uv, refined
-from .welding import cut, face_uv, net_faces, welded
+from .welding import cut, welded
 from .whole_surface import WholeSurface
 
 if TYPE_CHECKING:
@@ -217,23 +218,25 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
         return _of_one_chain(shape, settings, detail)
     skin = body_skin(shape, rest, SkinSettings(contours=settings.contours, rays=settings.rays, cap_contours=settings.cap_contours))
     surface = WholeSurface(shape, rest)
-    whole = welded(skin, body_parts(shape), surface)
-    faces = np.concatenate([net_faces(net) for net in whole.nets])
-    uv = face_uv(whole)
+    whole = caged(welded(skin, body_parts(shape), surface), shape)
+    faces, uv, part = whole.faces, whole.uv, whole.part
     near = mean_of_neighbours(faces, len(whole.vertices_m))
     free = within(near, whole.sewn, SEAM_RINGS)
-    uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, whole.part, surface), SEAM_RINGS))
-    vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, whole.part, surface), faces, near, free)
+    uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, part, surface), SEAM_RINGS))
+    vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
-    part, kept = whole.part, 1 - loose
+    kept = 1 - np.maximum(loose, whole.hand)
     seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
+    hand = whole.hand.astype(np.float64)
     for pieces in (settings.detail, detail):
         if pieces > 1:
-            columns = np.column_stack([weights, seam, 1 - kept])
+            columns = np.column_stack([weights, seam, 1 - kept, hand])
             vertices, both, part, faces, uv = cut(vertices, columns, part, faces, uv, pieces)
-            weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
+            weights, seam, kept, hand = strongest(both[:, :-3]), both[:, -3], 1 - both[:, -2], both[:, -1]
+            vertices = rounded(vertices, faces, hand > 0)
     if detail * settings.detail > 1:
-        vertices = vertices + kept[:, None] * (surface.projected(vertices, part, CUT_STEPS) - vertices)
+        rows = np.flatnonzero(kept)
+        vertices[rows] += kept[rows, None] * (surface.projected(vertices[rows], part[rows], CUT_STEPS) - vertices[rows])
     vertices = faired(unflipped(vertices, faces, seam > 0), faces, part, kept)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names, pieces=detail)
 

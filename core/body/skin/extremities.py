@@ -13,14 +13,12 @@ head 228 mm high, 195 long, 154 wide; hand 189 long, 85 wide; foot 266 long, 98 
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 from ..metaballs import VISIBLE, Metaballs
 from ..parts import SIDES, BoneProfile, bone_profiles, chain_neighbours
 from ..shape import BodyShape
-from .mesh import SkinSettings
 
 SIZE = 0.12  # sigma of ln s across the bone in (1)
 LENGTH = 0.03  # sigma of ln s along the bone
@@ -143,12 +141,6 @@ def person_shape(shape: BodyShape) -> BodyShape:
     )
     sigma = np.concatenate([shape.radius_sigma_m[kept], np.full((len(balls.weight) - kept.sum(), 3), np.nan)])
     return replace(shape, metaballs=balls, radius_sigma_m=sigma, weight_sigma=None)
-
-
-@lru_cache(maxsize=4)
-def shape_for_skin(shape: BodyShape, settings: SkinSettings) -> BodyShape:
-    """The body of which a skin with these settings is made."""
-    return person_shape(shape) if settings.anatomy else shape
 
 
 def _slender_neck(shape: BodyShape) -> Metaballs:

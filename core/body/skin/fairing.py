@@ -15,6 +15,7 @@ import numpy as np
 
 from ..shape import BodyShape
 from .extremities import TABLES
+from .fingers import FINGER_BONE
 from .surface_operators import factorised, laplacian, vertex_normals
 
 CURVATURE_M = 0.05  # ℓ of (1)
@@ -25,7 +26,9 @@ STEPS = 2  # the second with the normals of the first
 
 def anatomical(shape: BodyShape, weights: np.ndarray) -> np.ndarray:
     """(V,) 0 to 1: to what degree vertices with these weights (V, B) belong to bones with anatomical shapes."""
-    own = [bone.name.removesuffix(".R").removesuffix(".L") in TABLES for bone in shape.skeleton.bones]
+    own = [
+        bone.name.removesuffix(".R").removesuffix(".L") in TABLES or bool(FINGER_BONE.fullmatch(bone.name)) for bone in shape.skeleton.bones
+    ]
     return np.asarray(weights[:, own].sum(axis=1))
 
 

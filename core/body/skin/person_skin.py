@@ -18,6 +18,7 @@ from ..shape import BodyShape
 from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
 from .fairing import anatomical, faired
+from .fingers import RIGID_HAND_BONE
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
 from .relief import SurfacePoints, measured_relief
@@ -149,7 +150,8 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
     measured = [name for name in ("relief_m", "sigma_m") if name in arrays]
     store.check_layout(path, arrays, **layout, **{name: ("f", "V") for name in measured})
     names, count = header.get("bone_names"), len(arrays["vertices_m"])
-    if names != [bone.name for bone in shape.skeleton.bones]:
+    bone_names = [bone.name for bone in shape.skeleton.bones]
+    if names not in (bone_names, [name for name in bone_names if not RIGID_HAND_BONE.fullmatch(name)]):  # the latter: with mittens
         raise InputError(f"{path} has other bones than body.toml; run the fit again.")
     faces, bones, weights = arrays["faces"].astype(np.int64), arrays["bones"].astype(np.int64), arrays["weights"].astype(np.float64)
     pieces, rays = (n if isinstance(n := header.get(name), int) and n >= 0 else -1 for name in ("pieces", "rays"))
@@ -163,7 +165,7 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
     finite = all(np.isfinite(a).all() for a in (arrays["vertices_m"], arrays["uv"], weights, *(arrays[name] for name in measured)))
     if not (inside and finite and (weights >= 0).all() and (weights.sum(axis=1) > 0).all()):
         raise InputError(f"{path} is damaged: its faces, weights or positions cannot be; run the fit again.")
-    table = np.zeros((count, len(names)))
+    table = np.zeros((count, len(bone_names)))
     np.put_along_axis(table, bones, weights / weights.sum(axis=1, keepdims=True), axis=1)
     return OneSkin(
         vertices_m=arrays["vertices_m"],
@@ -171,7 +173,7 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
         uv=arrays["uv"],
         weights=table,
         part=arrays["part"],
-        bone_names=tuple(names),
+        bone_names=tuple(bone_names),
         pieces=pieces,
         rays=rays,
         relief_m=arrays.get("relief_m"),

@@ -32,6 +32,7 @@ from ...foundation.threads import in_threads
 from ...geometry.robust import TUKEY, mad_sigma
 from ..shape import BodyShape
 from .closed_skin import OneSkin
+from .fingers import FINGER_BONE
 from .posed import Poser
 from .surface_operators import factorised, laplacian, vertex_normals
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 PRIOR_M = 0.010  # s of (2): how far a body of metaballs lies from a person …
 THIN_PRIOR_M = 0.003  # … and its hands and feet, whose own pose is hardly measured
+FINGERS_REACH = 4.0  # vertices that follow fingers by a quarter count as theirs
 KAPPA = 25.0  # κ of (2) [1/m]: a range of 11 cm
 GATE = 4.0  # s; points farther from the skin belong to something else
 LEAST_COSINE = 0.4  # … and so do those whose normals differ more
@@ -95,13 +97,14 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
         Cancelled: the monitor was cancelled.
     """
     poser, normals = Poser(shape, skin.weights), vertex_normals(skin.vertices_m, skin.faces)
-    size = _prior_sigma(shape, skin)
+    size, fingers = _prior_sigma(shape, skin), _fingers(shape, skin)
+    gate = np.where(fingers < 0.5, GATE * size, 0.0)
     prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
     delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
         moved, found = skin.vertices_m + delta[:, None] * normals, list[_Observed]()
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-        observed = partial(_observed, poser, moved, skin.faces, delta, GATE * size)
+        observed = partial(_observed, poser, moved, skin.faces, delta, gate)
         for i in range(0, len(chosen), TOGETHER):
             monitor.step("relief", done * len(chosen) + i, len(ROUNDS) * len(chosen) + 1)
             found += in_threads(observed, [frames[row] for row in chosen[i : i + TOGETHER]])
@@ -113,7 +116,7 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
         total, right = (np.bincount(seen.vertex, w, len(delta)) for w in (weight, weight * seen.d))
         factor = factorised(prior.T @ prior, total)
         delta, sigma = factor.solve(right), _sigmas(factor, prior, seen, weight)
-    return Relief(displacement_m=delta, sigma_m=sigma)
+    return Relief(displacement_m=(1 - fingers) * delta, sigma_m=np.hypot((1 - fingers) * sigma, fingers * size))
 
 
 class _Nearby:
@@ -136,7 +139,13 @@ class _Nearby:
 def _prior_sigma(shape: BodyShape, skin: OneSkin) -> np.ndarray:
     """s (V,) of (2)."""
     thin = [bone.name.split(".")[0] in ("hand", "foot") for bone in shape.skeleton.bones]
-    return np.asarray(PRIOR_M * (THIN_PRIOR_M / PRIOR_M) ** skin.weights[:, thin].sum(axis=1))
+    return np.asarray(PRIOR_M * (THIN_PRIOR_M / PRIOR_M) ** np.minimum(1.0, skin.weights[:, thin].sum(axis=1) + _fingers(shape, skin)))
+
+
+def _fingers(shape: BodyShape, skin: OneSkin) -> np.ndarray:
+    """(V,) 0 to 1: to what degree a vertex is a finger's: these keep their shape, because the bends of fingers are not measured."""
+    own = [FINGER_BONE.fullmatch(bone.name) is not None for bone in shape.skeleton.bones]
+    return np.minimum(1.0, FINGERS_REACH * skin.weights[:, own].sum(axis=1))
 
 
 def _prior(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray) -> "sparse.csc_matrix":

@@ -11,6 +11,7 @@ four neighbours. The parts' fields in the pose of the parts' skin decide to whic
 Quads of nets of rings, their texture coordinates, and their subdivision.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -252,19 +253,28 @@ def _fan(ring: np.ndarray, pole: int | None) -> np.ndarray:
     return np.stack([np.full(len(k), -1 if pole is None else pole), ring[k], ring[k + 1], ring[(k + 2) % len(ring)]], axis=1)
 
 
-def face_uv(whole: Welded) -> np.ndarray:
-    """Texture coordinates (F, 4, 2) in the order of the nets' faces: one island per part, side by side, all at one scale.
+def face_uv(whole: Welded, ends: Sequence[tuple[float, float]] = ()) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Texture coordinates (F, 4, 2) in the order of the nets' faces, and corner (2,) and size (2,) of islands for `ends`, sizes in metres.
 
-    u runs around the bones, v along them; an island is as wide as its part's mean girth and as high as the part is long.
+    One island per part, side by side, and those of the ends above them, all at one scale. u runs around the bones, v along them; an island
+    is as wide as its part's mean girth and as high as the part is long.
     """
     sizes = [_girth_and_length(whole, net) for net in whole.nets]
-    scale = (1 - 2 * MARGIN) / max(sum(width for width, _ in sizes) * (1 + MARGIN * len(sizes)), max(height for _, height in sizes))
+    rows = [row for row in (sizes, list(ends)) if row]
+    scale = min(
+        *((1 - 2 * MARGIN) / (sum(width for width, _ in row) * (1 + MARGIN * len(row))) for row in rows),
+        (1 - (1 + len(rows)) * MARGIN) / sum(max(height for _, height in row) for row in rows),
+    )
     islands, left = [], MARGIN
     for net, (width, height) in zip(whole.nets, sizes):
         uv = _net_uv(net)
         islands.append(uv * [scale * width, scale * height] + [left, MARGIN])
         left += scale * width + MARGIN * scale * width
-    return np.concatenate(islands)
+    charts, left, bottom = [], MARGIN, 2 * MARGIN + scale * max(height for _, height in sizes)
+    for width, height in ends:
+        charts.append((np.array([left, bottom]), scale * np.array([width, height])))
+        left += (1 + MARGIN) * scale * width
+    return np.concatenate(islands), charts
 
 
 def _girth_and_length(whole: Welded, net: Net) -> tuple[float, float]:

@@ -11,7 +11,8 @@ from tricap.core.body.parts import bone_profiles, chain_neighbours
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import body_skin
-from tricap.core.body.skin.extremities import TABLES, person_shape, shape_for_skin
+from tricap.core.body.skin.extremities import TABLES, person_shape
+from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.mesh import SkinSettings
 
 
