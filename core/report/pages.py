@@ -13,7 +13,7 @@ import numpy as np
 from ..body.limb_words import limb_words, sentence
 from ..body.motion import BodyFit
 from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.fingers import shape_for_skin
+from ..body.skin.extremities import shape_with_ends
 from ..body.skin.mesh import Skin
 from ..body.skin.posed import skins_in
 from ..foundation import store
@@ -105,7 +105,7 @@ def _skin(report: Report) -> Callable[[np.ndarray], Skin] | None:
         return None
     settings = SkinSettings(**report.record["settings"]["skin"])
     try:
-        return skins_in(shape_for_skin(report.body.shape, settings), report.body.motion.values, settings)
+        return skins_in(shape_with_ends(report.body.shape, settings), report.body.motion.values, settings)
     except InputError:
         return None
 
@@ -138,7 +138,7 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
             add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
         if body is not None and skinned:
-            skin = body_skin(shape_for_skin(body.shape, settings), body.motion.values[i], settings)  # exact, as the silhouettes' figures
+            skin = body_skin(shape_with_ends(body.shape, settings), body.motion.values[i], settings)  # exact, as the silhouettes' figures
             for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)

@@ -21,7 +21,7 @@ from ..body.motion import BodyFit
 from ..body.shape import BodyShape
 from ..body.skeleton import Skeleton
 from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.fingers import shape_for_skin
+from ..body.skin.extremities import shape_with_ends
 from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import filled
 from ..foundation.errors import InputError
@@ -129,7 +129,7 @@ def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
 def body_masks(cameras: Sequence[Camera], shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> list[np.ndarray]:
     """The silhouette of a body in each camera (h, w), holes filled; empty for a body without a skin."""
     try:
-        skin = body_skin(shape_for_skin(shape, settings), values, settings)
+        skin = body_skin(shape_with_ends(shape, settings), values, settings)
     except InputError:
         return [np.zeros(camera.size_px[::-1], bool) for camera in cameras]
     masks = []

@@ -13,12 +13,14 @@ head 228 mm high, 195 long, 154 wide; hand 189 long, 85 wide; foot 266 long, 98 
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ..metaballs import VISIBLE, Metaballs
 from ..parts import SIDES, BoneProfile, bone_profiles, chain_neighbours
 from ..shape import BodyShape
+from .mesh import SkinSettings
 
 SIZE = 0.12  # sigma of ln s across the bone in (1)
 LENGTH = 0.03  # sigma of ln s along the bone
@@ -141,6 +143,12 @@ def person_shape(shape: BodyShape) -> BodyShape:
     )
     sigma = np.concatenate([shape.radius_sigma_m[kept], np.full((len(balls.weight) - kept.sum(), 3), np.nan)])
     return replace(shape, metaballs=balls, radius_sigma_m=sigma, weight_sigma=None)
+
+
+@lru_cache(maxsize=4)
+def shape_with_ends(shape: BodyShape, settings: SkinSettings) -> BodyShape:
+    """The body of which contours with these settings are cast; its bones are those of the fit."""
+    return person_shape(shape) if settings.anatomy else shape
 
 
 def _slender_neck(shape: BodyShape) -> Metaballs:

@@ -15,7 +15,7 @@ import numpy as np
 from ..metaballs import VISIBLE
 from ..shape import BodyShape
 from ..skeleton import Bone
-from .extremities import TABLES, person_shape
+from .extremities import TABLES, shape_with_ends
 from .hand_template import FINGERS, THUMB, finger_frames
 from .mesh import SkinSettings
 
@@ -26,8 +26,8 @@ RIGID_HAND_BONE = re.compile(FINGER_BONE.pattern + r"|palm\.(thumb|index|middle|
 
 @lru_cache(maxsize=4)
 def shape_for_skin(shape: BodyShape, settings: SkinSettings) -> BodyShape:
-    """The body of which a skin with these settings is made."""
-    return with_fingers(person_shape(shape)) if settings.anatomy else shape
+    """The body of which a skin with these settings is made: that of `shape_with_ends`, with the bones of its fingers."""
+    return with_fingers(shape_with_ends(shape, settings)) if settings.anatomy else shape
 
 
 def palm_bone(finger: str, side: str) -> str:

@@ -11,7 +11,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, one_skin
-from tricap.core.body.skin.extremities import person_shape
+from tricap.core.body.skin.extremities import person_shape, shape_with_ends
 from tricap.core.body.skin.fingers import FINGER_BONE, RIGID_HAND_BONE, shape_for_skin
 from tricap.core.body.skin.hand_template import FINGERS, RING, THUMB, UNIT_MM, hand_template
 from tricap.core.body.skin.hands import row_counts, row_of_quads
@@ -156,3 +156,10 @@ def test_files_with_and_without_fingers_are_read(tmp_path: Path) -> None:
     read = read_skin(tmp_path / "old.npz", person())
     assert read.bone_names == tuple(names())
     assert not read.weights[:, [bool(RIGID_HAND_BONE.fullmatch(name)) for name in names()]].any()
+
+
+def test_the_contours_of_the_report_have_the_bones_of_the_fit() -> None:
+    shape = default_shape(read_model("full"))
+    cast = shape_with_ends(shape, SkinSettings())
+    assert [bone.name for bone in cast.skeleton.bones] == [bone.name for bone in shape.skeleton.bones]
+    assert len(shape_for_skin(shape, SkinSettings()).skeleton.bones) > len(cast.skeleton.bones)
