@@ -11,7 +11,7 @@ import pytest
 from tricap.addon import command
 from tricap.addon.retarget import command as retargeting
 from tricap.core.cli.parser import build_parser
-from tricap.core.run.take_run import SETTINGS
+from tricap.core.run.settings import SETTINGS
 
 ROOT = Path(__file__).resolve().parent.parent
 NUMBERS = [*(str(n) for n in range(1, 86)), *(f"B{n}" for n in range(1, 19))]

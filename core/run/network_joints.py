@@ -65,6 +65,7 @@ def open_network(path: Path, monitor: Monitor) -> PoseNetwork:
     """
     data = read_onnx(path)
     input_shape(data, path)
+    monitor.check()
     command, environment = python_command(TRIAL)
     pipe = subprocess.PIPE
     with subprocess.Popen([*command, str(path)], env=environment, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL) as trial:

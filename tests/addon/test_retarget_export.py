@@ -127,7 +127,7 @@ def test_the_full_models_names(empty: ModuleType, full_run: Path, tmp_path: Path
 
 @pytest.mark.parametrize("kind", ["bvh", "glb", "c3d"])
 def test_a_run_of_one_frame_goes_out(empty: ModuleType, full_run: Path, tmp_path: Path, kind: str) -> None:
-    assert export_file(full_run, kind, tmp_path / f"a.{kind}", "plain", Monitor()).endswith("1 frames")
+    assert export_file(full_run, kind, tmp_path / f"a.{kind}", "plain", Monitor()).partition(", ")[0].endswith("1 frames")
 
 
 def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_run: SmallRun, tmp_path: Path) -> None:

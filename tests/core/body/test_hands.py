@@ -10,12 +10,12 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, one_skin
+from tricap.core.body.skin.closed_skin import OneSkin, flipped, one_skin
 from tricap.core.body.skin.extremities import person_shape, shape_with_ends
 from tricap.core.body.skin.fingers import FINGER_BONE, RIGID_HAND_BONE, shape_for_skin
 from tricap.core.body.skin.hand_template import FINGERS, RING, THUMB, UNIT_MM, hand_template
 from tricap.core.body.skin.hands import row_counts, row_of_quads
-from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.mesh import DETAIL, SkinSettings
 from tricap.core.body.skin.person_skin import REST, read_skin, write_skin
 from tricap.core.body.skin.posed import Poser
 from tricap.core.body.skin.relief import SurfacePoints, measured_relief
