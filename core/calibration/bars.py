@@ -22,11 +22,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import ClassVar
 
-import cv2
 import numpy as np
 
 from ..foundation.arrays import frozen
 from ..geometry.camera import Camera
+from ..geometry.fundamental import fundamental_matrix
 from ..geometry.robust import mad_sigma
 from ..geometry.small_matrices import invert_spd
 from .network import BarNetwork
@@ -58,12 +58,8 @@ def agreeing(xi: np.ndarray, xj: np.ndarray, width_px: float) -> tuple[np.ndarra
         return none
     some = np.unique(np.linspace(0, len(xi) - 1, MAX_POINTS).astype(int))
     tolerance = PAIR_TOLERANCE * width_px
-    F, _ = cv2.findFundamentalMat(
-        np.ascontiguousarray(xi[some]), np.ascontiguousarray(xj[some]), cv2.USAC_MAGSAC, tolerance, 0.999, MAGSAC_ITERATIONS
-    )
-    if F is None or F.shape != (3, 3):
-        return none
-    return sampson(F, xi, xj) < tolerance, F
+    found = fundamental_matrix(xi[some], xj[some], tolerance, 0.999, MAGSAC_ITERATIONS)
+    return none if found is None else (sampson(found[0], xi, xj) < tolerance, found[0])
 
 
 def sampson(F: np.ndarray, xi: np.ndarray, xj: np.ndarray) -> np.ndarray:

@@ -11,10 +11,10 @@ The first d_c come from pairs of cameras, without knowing the cameras: the delay
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from ..foundation.arrays import frozen
+from ..geometry.fundamental import fundamental_matrix
 from .bars import sampson
 
 STEPS = np.arange(-3, 4)  # images of (1), as far as they are known
@@ -160,11 +160,8 @@ def _distance(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], 
 
 
 def _of_one_matrix(ni: np.ndarray, nj: np.ndarray) -> float:
-    try:
-        F, _ = cv2.findFundamentalMat(np.ascontiguousarray(ni), np.ascontiguousarray(nj), cv2.USAC_MAGSAC, WIDTH / 2, 0.99, ITERATIONS)
-    except cv2.error:  # OpenCV 5.0 raises where no sample gives a matrix
-        F = None
-    return WIDTH if F is None or F.shape != (3, 3) else float(np.minimum(sampson(F, ni, nj), WIDTH).mean())
+    found = fundamental_matrix(ni, nj, WIDTH / 2, 0.99, ITERATIONS)
+    return WIDTH if found is None else float(np.minimum(sampson(found[0], ni, nj), WIDTH).mean())
 
 
 def in_order(moving_px: np.ndarray, moved_px: np.ndarray, labelled_px: np.ndarray, delay_images: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
+from ..geometry.fundamental import fundamental_matrix
 from ..geometry.rotation import cross_matrix
 from ..images.interlace import RowGrid
 
@@ -114,11 +115,10 @@ class PairMatches:
         rows = np.unique(np.rint(np.hstack([self.xi_px, self.xj_px])), axis=0, return_index=True)[1]
         if len(rows) < FEWEST_MATCHES:
             return None
-        xi, xj = np.ascontiguousarray(self.xi_px[rows]), np.ascontiguousarray(self.xj_px[rows])
-        F, inlier = cv2.findFundamentalMat(xi, xj, cv2.USAC_MAGSAC, INLIER_PX, 0.999, 4000)
-        if F is None or inlier is None or inlier.sum() - MINIMAL_MATCHES < INLIER_SHARE * (len(xi) - MINIMAL_MATCHES):
+        found = fundamental_matrix(self.xi_px[rows], self.xj_px[rows], INLIER_PX, 0.999, 4000)
+        if found is None or found[1].sum() - MINIMAL_MATCHES < INLIER_SHARE * (len(rows) - MINIMAL_MATCHES):
             return None
-        return rows[inlier.ravel() > 0]
+        return rows[found[1]]
 
     def consistent(self) -> "PairMatches | None":
         """The `inliers`."""

@@ -8,6 +8,7 @@ MediaPipe   (1, 5 K): x, y, z, and the logits of visibility and presence (BlazeP
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,24 +21,39 @@ BLAZEPOSE = (
 ).split()
 OF_BLAZEPOSE = 5  # numbers of a point
 LEAST = 1e-6  # of a heat map, for its logarithm
-Decoder = Callable[[Sequence[np.ndarray]], np.ndarray]
+IMAGENET = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # mean and standard deviation of RGB, 0 to 255 (as mmpose and timm use them)
+UNIT = (0.0, 0.0, 0.0), (255.0, 255.0, 255.0)
 
 
-def decoder_of(outputs: Sequence[np.ndarray], size_px: tuple[int, int]) -> tuple[Decoder, tuple[str, ...]] | None:
-    """What makes (K, 3) x, y and confidence, 0 to 1, from outputs like these of a network with an input of (width, height), and the names
-    of the K points; None for a layout that is not known."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Layout:
+    """What a network takes and returns: the colours (RGB) that become 0 and ±1, the K points, and what makes (K, 3) of the outputs: x and y
+    in the input's pixels, and the confidence, 0 to 1."""
+
+    names: tuple[str, ...]
+    colours: tuple[tuple[float, ...], tuple[float, ...]]
+    decode: Callable[[Sequence[np.ndarray]], np.ndarray]
+
+
+def layout_of(outputs: Sequence[np.ndarray], size_px: tuple[int, int]) -> Layout | None:
+    """The layout of a network with outputs like these and an input of (width, height); None if it is not known."""
     width, height = size_px
     flat = [o for o in outputs if o.ndim == 2 and o.shape[0] == 1 and o.shape[1] >= OF_BLAZEPOSE * len(BLAZEPOSE)]
     if len(outputs) == 1 and outputs[0].ndim == 4 and (names := _names(outputs[0].shape[1])):
-        return lambda found: _from_heat_maps(found[0], size_px)[: len(names)], names
+        return Layout(names=names, colours=IMAGENET, decode=lambda found: _from_heat_maps(found[0], size_px)[: len(names)])
     if len(outputs) == 2 and all(o.ndim == 3 for o in outputs) and outputs[0].shape[1] == outputs[1].shape[1]:
         names, (along_x, along_y) = _names(outputs[0].shape[1]), (o.shape[2] for o in outputs)
         if names and along_x * height == along_y * width:
-            return lambda found: _from_distributions(found[0], found[1], along_x / width)[: len(names)], names
+            bins = along_x / width
+            return Layout(names=names, colours=IMAGENET, decode=lambda found: _from_distributions(found[0], found[1], bins)[: len(names)])
     if flat and flat[0].shape[1] % OF_BLAZEPOSE == 0:
         rank = [o.shape for o in outputs].index(flat[0].shape)
         sure = next((i for i, o in enumerate(outputs) if o.size == 1), None)
-        return lambda found: _from_blazepose(found[rank], 1.0 if sure is None else float(found[sure].ravel()[0])), tuple(BLAZEPOSE)
+        return Layout(
+            names=tuple(BLAZEPOSE),
+            colours=UNIT,
+            decode=lambda found: _from_blazepose(found[rank], 1.0 if sure is None else float(found[sure].ravel()[0])),
+        )
     return None
 
 

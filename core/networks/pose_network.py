@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 
 from ..foundation.errors import InputError
-from .decoders import BLAZEPOSE, Decoder, decoder_of
+from .decoders import Layout, layout_of
 from .onnx_file import input_shape
 
-MEAN, STANDARD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # of ImageNet's images in RGB, 0 to 255 (as mmpose and timm use them)
 MARGIN = 1.25  # size of the cut-out over the person's box, as in mmpose's and BlazePose's training
 LARGEST_SIDE = 2048  # pixels of an input
 CHANNELS = 3
@@ -19,11 +18,10 @@ KNOWN = "heat maps (HRNet, ViTPose), SimCC (RTMPose) with 17, 26 or 133 points, 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PoseNetwork:
-    """An opened network. `names`: of its K points."""
+    """An opened network."""
 
-    names: tuple[str, ...]
     _net: cv2.dnn.Net
-    _decode: Decoder
+    _layout: Layout
     _size_px: tuple[int, int]  # width and height of its input
     _channels_last: bool
 
@@ -46,11 +44,16 @@ class PoseNetwork:
         except cv2.error as error:
             raise InputError(f"OpenCV cannot read the network {path}: {_reason(error)}.") from error
         outputs = _run(net, np.zeros((1, height, width, 3) if last else (1, 3, height, width), dtype=np.float32), path)
-        found = decoder_of(outputs, (width, height))
-        if found is None:
+        layout = layout_of(outputs, (width, height))
+        if layout is None:
             shapes = ", ".join(" × ".join(map(str, o.shape)) for o in outputs)
             raise InputError(f"{path} returns {shapes}; known are {KNOWN}.")
-        return PoseNetwork(names=found[1], _net=net, _decode=found[0], _size_px=(width, height), _channels_last=last)
+        return PoseNetwork(_net=net, _layout=layout, _size_px=(width, height), _channels_last=last)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its K points."""
+        return self._layout.names
 
     def joints(self, image: np.ndarray, box_px: tuple[float, float, float, float]) -> np.ndarray:
         """(K, 3) x, y and confidence, 0 to 1, in an RGB image (h, w, 3) float32, 0 to 255, that shows the person in a box (left, top,
@@ -66,9 +69,10 @@ class PoseNetwork:
         centre = (np.array(self._size_px) - 1) / 2
         warp = np.column_stack([np.eye(2) / scale, centre - middle / scale])
         part = cv2.warpAffine(image, warp, self._size_px, flags=cv2.INTER_LINEAR)
-        part = part / 255 if self.names == tuple(BLAZEPOSE) else (part - MEAN) / STANDARD
+        zero, one = self._layout.colours
+        part = (part - zero) / one
         blob = (part if self._channels_last else part.transpose(2, 0, 1))[None].astype(np.float32)
-        found = self._decode(_run(self._net, np.ascontiguousarray(blob), None))
+        found = self._layout.decode(_run(self._net, np.ascontiguousarray(blob), None))
         found[:, :2] = (found[:, :2] - centre) * scale + middle
         return found
 
