@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from coded_movies import coded_movie
 from pose_graphs import pose_graph
 from scene_files import model, record, write_fbx, write_gltf, zeros
 
@@ -43,6 +44,7 @@ from tricap.core.run.inspection import read_points as read_shown
 from tricap.core.run.stages import valid_stages
 from tricap.core.run.take_run import Run
 from tricap.core.synchronising.sound import read_wav
+from tricap.core.synchronising.time_code import read_time_code
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take.bar_file import read_bar, write_bar
 from tricap.core.take.clock import read_timestamps
@@ -370,6 +372,7 @@ READERS: dict[str, tuple[Make, Read]] = {
                    lambda f: tables.read_joints(f / "joints.csv")),
     "timestamps": (text("t.csv", "cam_id,frame_index,frame_time\n0,1,20.1\n0,0,20.0\n1,0,20.2\n0,2,20.25\n"),
                    lambda f: read_timestamps(f / "t.csv", "cam_0")),
+    "time code": (written("a.mov", lambda p: p.write_bytes(coded_movie(90_000))), lambda f: read_time_code(f / "a.mov")),
     "wav": (written("a.wav", sound), lambda f: read_wav(f / "a.wav")),
     "motion.csv": (written("motion.csv", motion_table), lambda f: tables.read_motion(f / "motion.csv", read_model("arm.R").skeleton)),
     "frames.csv": (text("frames.csv", FRAMES),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Synchronise(JobOperator, bpy.types.Operator):
-    """Find when each camera began, by the sound of its movie (or NAME.wav in the project folder), then by the rays of moving points"""
+    """Find when each camera began: by the sound of its movie or NAME.wav, a switched lamp, a flash or time codes; then by moving points"""
 
     bl_idname = "tricap.synchronise"
     bl_label = "Synchronise"

@@ -122,7 +122,7 @@ def _joints(commands: Any) -> None:
 
 
 def _synchronise(commands: Any) -> None:
-    about = "when each view began: by its sound (NAME.wav, or the movie's own in Blender), then by the rays of moving points"
+    about = "when each view began: by sound (NAME.wav; in Blender the movie's own), light or time codes, then by rays of moving points"
     parser = _command(commands, "synchronise", about, action("synchronise"))
     _take_argument(parser)
     parser.add_argument("--write", action="store_true", help="write the starts into take.toml, if all were found")

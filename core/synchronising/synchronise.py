@@ -1,12 +1,15 @@
-"""`tricap synchronise`: when each view began, by the sound of its recording, then by the rays of points that move.
+"""`tricap synchronise`: when each view began, by the sound of its recording, else by changes of the light, else by time codes, then by the
+rays of points that move.
 
 Sound gives the beginning to some tenths of a millisecond, the drift of the clock, and finds recordings that were started minutes apart. It
 needs time to travel: between cameras at a distance b of each other a noise arrives up to b / 343 m/s earlier in one, which the sigma
-contains (uniformly distributed directions: b / √3 / 343 m/s). The rays (`checking.timing`) have no such error; with a rig they measure what
-is left, or everything where there is no sound and the views began within the reach of `tricap check`.
+contains (uniformly distributed directions: b / √3 / 343 m/s). Light needs none (`light`): a lamp that is switched, or a flash, gives the
+beginning to a part of an image. Time codes (`time_code`) give it to an image or so, if the clocks of the cameras were set together: each
+camera counts whole images, so the sigma is that of a uniform distribution. The rays (`checking.timing`) have no such error; with a rig they
+measure what is left, or everything where there is nothing else and the views began within the reach of `tricap check`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +18,14 @@ import numpy as np
 from ..checking.timing import TimeOffset, estimate_offsets
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..images.sequence import open_sequence
+from ..take.clock import Clock, clocks_of
 from ..take.footage import Footage, open_take
 from ..take.take import Take, View
 from ..take.writing import read_table, write_table
-from .sound import Sound, SoundOffset, offset_between, read_wav
+from .light import LightChange, brightness_of, light_changes, offset_by_light
+from .sound import Sound, offset_between, read_wav
+from .time_code import TimeCode, read_time_code, started_after
 
 SPEED_OF_SOUND_M_S = 343.0
 USUAL_DISTANCE_M = 2.0  # between two cameras without a rig
@@ -38,7 +45,7 @@ class ViewTiming:
     start_s: float
     sigma_s: float
     drift_ppm: float
-    method: str  # "reference", "sound", "rays", "sound and rays", or "" where it was not found
+    method: str  # "reference", "sound", "light", "time code", "rays", one of them “and rays”, or "" where it was not found
     problem: str = ""  # why it was not found, and what to do
 
     @property
@@ -77,10 +84,16 @@ def synchronise(take: Take, monitor: Monitor, movie_sound: MovieSound | None = N
     reference = take.views[take.reference]
     timings = {reference.name: _timing(reference, reference.start_s, 0.0, reference.drift_ppm, "reference")}
     others = [v for v in take.views if v is not reference]
+    lights = _Lights(take)
     for n, view in enumerate(others):
-        a, b = sounds[reference.name], sounds[view.name]
-        heard = offset_between(a, b, monitor.part("comparing sound", n, len(others))) if a and b else None
-        timings[view.name] = _by_sound(take, view, heard) if heard else _lost(take, view, a, b, sounded=movie_sound is not None)
+        a, b, part = sounds[reference.name], sounds[view.name], monitor.part("finding the start", n, len(others))
+        heard = offset_between(a, b, part) if a and b else None
+        if heard is not None:
+            sigma_s = float(np.hypot(heard.sigma_s, _distance_m(take, view) / np.sqrt(3) / SPEED_OF_SOUND_M_S))
+            timings[view.name] = _placed(take, view, heard.offset_s, heard.drift, sigma_s, "sound")
+        else:
+            seen = lights.timing(view, part) or _by_time_code(take, view)
+            timings[view.name] = seen or _lost(take, view, a, b, sounded=movie_sound is not None)
     return (
         _with_rays(take, [timings[v.name] for v in take.views], monitor)
         if take.rig_path.is_file()
@@ -119,16 +132,58 @@ def _timing(view: View, start_s: float, sigma_s: float, drift_ppm: float, method
     return ViewTiming(view=view.name, start_s=start_s, sigma_s=sigma_s, drift_ppm=drift_ppm, method=method)
 
 
-def _by_sound(take: Take, view: View, heard: SoundOffset) -> ViewTiming:
-    """On the clock of the reference view, T = T₀ + (1 + k₀) t."""
+def _placed(take: Take, view: View, offset_s: float, drift: float, sigma_s: float, method: str) -> ViewTiming:
+    """A view that began `offset_s` after the reference view by its clock, on the take's clock: T = T₀ + (1 + k₀) t."""
     reference = take.views[take.reference]
-    rate = take.fps / take.field_layout.per_image
-    zero_s = reference.start_s - reference.offset_frames / (reference.fps or rate)
     slow = 1 + 1e-6 * reference.drift_ppm
-    start_s = zero_s + slow * heard.offset_s
-    drift_ppm = 1e6 * (slow * (1 + heard.drift) - 1)
-    sigma_s = float(np.hypot(heard.sigma_s, _distance_m(take, view) / np.sqrt(3) / SPEED_OF_SOUND_M_S))
-    return _timing(view, start_s, sigma_s, drift_ppm, "sound")
+    start_s = _zero(reference, _rate(take)) + slow * offset_s
+    return _timing(view, start_s, sigma_s, 1e6 * (slow * (1 + drift) - 1), method)
+
+
+class _Lights:
+    """The changes of the light in the views of a take, each found when it is needed."""
+
+    def __init__(self, take: Take) -> None:
+        self._take, self._found = take, dict[str, tuple[tuple[LightChange, ...], Clock]]()
+
+    def timing(self, view: View, monitor: Monitor) -> ViewTiming | None:
+        """The beginning of a view by the light; None where it does not change alike in it and the reference view."""
+        a, a_clock = self._of(self._take.views[self._take.reference], monitor)
+        b, b_clock = self._of(replace(view, start_s=0.0, drift_ppm=0.0, offset_frames=0), monitor) if a else ((), a_clock)
+        lit = offset_by_light(a, b, _moments(a, a_clock), _moments(b, b_clock)) if b else None
+        return None if lit is None else _timing(view, lit.offset_s, lit.sigma_s, 1e6 * lit.drift, "light")
+
+    def _of(self, view: View, monitor: Monitor) -> tuple[tuple[LightChange, ...], Clock]:
+        if view.name not in self._found:
+            sequence = open_sequence(self._take.folder, images=view.images, movie=view.movie, view=view.name)
+            timed = replace(self._take, views=(replace(view, fps=view.fps or _rate(self._take)),))
+            brightness = brightness_of(sequence, self._take.rows_at(0), monitor)
+            self._found[view.name] = light_changes(brightness), clocks_of(timed, (sequence,))[0]
+        return self._found[view.name]
+
+
+def _moments(changes: Sequence[LightChange], clock: Clock) -> np.ndarray:
+    """The times (n, 2) of changes by a clock, and the intervals of the images then."""
+    times = [(clock.time_s(c.image), clock.time_s(c.image + 0.5) - clock.time_s(c.image - 0.5)) for c in changes]
+    return np.array(times).reshape(-1, 2)
+
+
+def _by_time_code(take: Take, view: View) -> ViewTiming | None:
+    """The beginning by the time codes of both movies; None where there are none, or they cannot be compared."""
+    a, b = (_time_code(take, v) for v in (take.views[take.reference], view))
+    offset_s = started_after(a, b) if a and b else None
+    if a is None or b is None or offset_s is None:
+        return None
+    return _placed(take, view, offset_s, 0.0, float(np.hypot(a.frame_s, b.frame_s) / np.sqrt(12)), "time code")
+
+
+def _time_code(take: Take, view: View) -> TimeCode | None:
+    return None if view.movie is None else read_time_code(take.folder / view.movie)
+
+
+def _rate(take: Take) -> float:
+    """Images per second of a view without a rate of its own."""
+    return take.fps / take.field_layout.per_image
 
 
 def _distance_m(take: Take, view: View) -> float:
@@ -149,7 +204,8 @@ def _lost(take: Take, view: View, a: Sound | None, b: Sound | None, *, sounded: 
         why = f"the sound of {view.name if b.silent else 'the reference view'} is silent"
     else:
         why = "its sound has nothing in common with that of the reference view"
-    advice = "Clap once at the beginning of a recording, or give its `start` in take.toml."
+    why += "; nor does the light change alike in both, nor have both movies a time code"
+    advice = "Clap once, or switch a lamp, at the beginning of a recording, or give its `start` in take.toml."
     return ViewTiming(view=view.name, start_s=np.nan, sigma_s=np.inf, drift_ppm=0.0, method="", problem=f"{why}. {advice}")
 
 
@@ -166,8 +222,7 @@ def with_starts(take: Take, timings: Mapping[str, ViewTiming]) -> Take:
 def _with_rays(take: Take, timings: list[ViewTiming], monitor: Monitor) -> tuple[ViewTiming, ...]:
     """The beginnings improved by the rays of moving points, where these are exact enough."""
     started = with_starts(take, {t.view: t for t in timings})
-    rate = take.fps / take.field_layout.per_image
-    views = tuple(replace(v, fps=v.fps or rate) for v in started.views)  # with clocks, views may differ in length
+    views = tuple(replace(v, fps=v.fps or _rate(take)) for v in started.views)  # with clocks, views may differ in length
     clicks = replace(started.clicks, joints={}, surface=())
     started = replace(started, views=views, clicks=clicks, keyframes=(), frames=None)  # frames may be those of wrong starts
     footage = open_take(started)
@@ -181,12 +236,12 @@ def _improved(take: Take, footage: Footage, timing: ViewTiming, offset: TimeOffs
     if timing.method == "reference" or offset.method != "rays" or sigma_s * rate > MOST_RAYS_SIGMA:
         return timing if timing.found else replace(timing, problem=f"too few moving points can be matched, and {timing.problem}")
     if timing.found and abs(late_s) > max(CONTRADICTION * np.hypot(sigma_s, timing.sigma_s), IMAGE_LATENESS_S):
-        why = f"its sound and the rays of moving points contradict each other by {1e3 * late_s:+.0f} ms"
-        advice = "Is its sound that of this recording, and the rig that of these cameras?"
+        why = f"its {timing.method} and the rays of moving points contradict each other by {1e3 * late_s:+.0f} ms"
+        advice = f"Is its {timing.method} that of this recording, and the rig that of these cameras?"
         return replace(timing, method="", problem=f"{why}. {advice}")
     view = next(v for v in take.views if v.name == timing.view)
     before_s = timing.start_s if timing.found else _zero(view, rate)
-    method = "sound and rays" if timing.found else "rays"
+    method = f"{timing.method} and rays" if timing.found else "rays"
     return replace(timing, start_s=before_s + late_s, sigma_s=sigma_s, method=method, problem="")
 
 
