@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...foundation.arrays import frozen
+from ...geometry.rotation import cross
 from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
@@ -94,11 +95,11 @@ def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def flipped(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The quads (F,) that, at one of their corners, face away from the surface around it: flipped ones, and those folded in themselves."""
     corner = vertices[faces]
-    normal = np.cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
+    normal = cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
     mean = np.stack([np.bincount(faces.ravel(), normal[..., k].ravel(), len(vertices)) for k in range(3)], axis=1)[faces]
-    whole = np.broadcast_to(normal.sum(axis=1, keepdims=True), normal.shape)
-    return np.asarray(((np.einsum("fck,fck->fc", normal, mean) <= 0) | (np.einsum("fck,fck->fc", whole, mean) <= 0)).any(axis=1))
+    whole = normal.sum(axis=1, keepdims=True)
+    return np.asarray((((normal * mean).sum(axis=2) <= 0) | ((whole * mean).sum(axis=2) <= 0)).any(axis=1))
 
 
 def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.ndarray) -> np.ndarray:
@@ -303,15 +304,29 @@ def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix"
 def unflipped(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
     """Vertices (V, 3): those that `may` move (V,), near flipped quads, move half way to their neighbours' mean until none is flipped."""
     found, near = np.array(vertices), None
+    bad = flipped(found, faces)
     for step in range(UNFLIPPING_STEPS):
-        bad = flipped(found, faces) & may[faces].all(axis=1)
-        if not bad.any():
+        chosen = bad & may[faces].all(axis=1)
+        if not chosen.any():
             break
         near = mean_of_neighbours(faces, len(found)) if near is None else near
-        moved = within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // UNFLIPPING_RING)
+        moved = within(near, np.isin(np.arange(len(found)), faces[chosen]), 1 + step // UNFLIPPING_RING)
         moved = moved[may[moved]]
         found[moved] = 0.5 * (found[moved] + near[moved] @ found)
+        _flipped_again(bad, found, faces, moved)
     return found
+
+
+def _flipped_again(bad: np.ndarray, vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray) -> None:
+    """Renew `bad` (F,), the flipped quads, after some vertices moved: only quads about these can have changed."""
+    near = np.zeros(len(vertices), dtype=bool)
+    near[moved] = True
+    rings = []
+    for _ in range(3):  # the quads of the vertices, those whose mean normals they change, and those that these means are made of
+        rings.append(np.flatnonzero(near[faces].any(axis=1)))
+        near[faces[rings[-1]]] = True
+    _, changed, around = rings
+    bad[changed] = flipped(vertices, faces[around])[np.searchsorted(around, changed)]
 
 
 def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix", free: np.ndarray) -> np.ndarray:

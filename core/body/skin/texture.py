@@ -84,8 +84,7 @@ class TextureBaker:
         self.texel, self._corners, self._shares = _texels(skin, size_px)
         n = len(self.texel)
         self._weight = np.zeros((n, KEPT), dtype=np.float32)
-        self._rgb = np.zeros((n, KEPT, 3), dtype=np.uint8)
-        self._view = np.zeros((n, KEPT), dtype=np.uint8)
+        self._colour = np.zeros((n, KEPT), dtype=np.uint32)  # see `_packed`
         sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
         self._trust = 1 / (1 + (self._at(sigma) / SIGMA_M) ** 2)
         self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
@@ -142,14 +141,19 @@ class TextureBaker:
 
     def _keep(self, rows: np.ndarray, rgb: np.ndarray, weight: np.ndarray, view: int) -> None:
         """Put colours in place of the ones with the smallest weights; slots are sorted, largest weight first."""
-        slot = KEPT - 1
-        better = weight > self._weight[rows, slot]
+        better = weight > self._weight[rows, -1]
         rows, rgb, weight = rows[better], rgb[better], weight[better]
-        self._weight[rows, slot], self._rgb[rows, slot], self._view[rows, slot] = weight, np.rint(rgb).astype(np.uint8), view
-        order = np.argsort(-self._weight[rows], axis=1, kind="stable")
-        for table in (self._weight, self._view):
-            table[rows] = np.take_along_axis(table[rows], order, axis=1)
-        self._rgb[rows] = np.take_along_axis(self._rgb[rows], order[:, :, None], axis=1)
+        own = self._weight[rows]
+        place = (own[:, :-1] >= weight[:, None]).sum(axis=1)  # of the new colours; those after it move on
+        slots, every = np.arange(KEPT), np.arange(len(rows))
+        order = slots - (slots > place[:, None])
+        for table, kept, new in (
+            (self._weight, own, weight),
+            (self._colour, self._colour[rows], _packed(np.rint(rgb).astype(np.uint8), view)),
+        ):
+            kept = np.take_along_axis(kept, order, axis=1)
+            kept[every, place] = new
+            table[rows] = kept
 
     def _exposures(self) -> np.ndarray:
         """(K,) g of (2)."""
@@ -174,7 +178,8 @@ class TextureBaker:
 
     def _averaged(self, rows: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Colours (N, 3) of texels that were seen."""
-        rgb = self._rgb[rows] / gain[self._view[rows]][:, :, None]
+        rgb, view = _unpacked(self._colour[rows])
+        rgb = rgb / gain[view][:, :, None]
         weight = self._weight[rows] / self._weight[rows, :1]
         robust = weight
         for _ in range(REWEIGHTINGS):
@@ -194,6 +199,18 @@ class TextureBaker:
         tie = STIFF * (count > 0)
         right = tie[:, None] * total / np.maximum(count, 1)[:, None] + WEAK * middle
         return self._at(factorised(sparse.diags(tie + WEAK) - C).solve(right))
+
+
+def _packed(rgb: np.ndarray, view: int) -> np.ndarray:
+    """Colours (N, 3) uint8 and the number of their view as one number each (N,) uint32: a sorted table moves one column instead of four."""
+    four = np.concatenate([rgb, np.full((len(rgb), 1), view, dtype=np.uint8)], axis=1)
+    return np.ascontiguousarray(four).view(np.uint32)[:, 0]
+
+
+def _unpacked(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The colours (N, K, 3) uint8 and views (N, K) of packed ones (N, K)."""
+    four = np.ascontiguousarray(colour).view(np.uint8).reshape(*colour.shape, 4)
+    return four[..., :3], four[..., 3]
 
 
 def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
