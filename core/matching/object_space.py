@@ -259,7 +259,7 @@ class _Adjustment:
             normal = normal_to(e)
             c = c + across[:, k, None] * normal
             inside = image.inside(c, np.array(patches.half) * INSIDE_SHARE)
-            rho, (gx, gy) = self._compare(k, theta, np.where(inside[:, None], c, 0.0), L, rows)
+            rho, (gx, gy) = self._compare(k, theta, np.where(inside[:, None], c, c[inside.argmax()] if inside.any() else 0.0), L, rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
             weight = visible / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
             rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
@@ -277,8 +277,9 @@ class _Adjustment:
         for piece in pieces(len(theta), len(patches.monomials)):
             own = piece if isinstance(rows, slice) else rows[piece]
             x, y = self._lines[k].warp(theta[piece], patches.monomials, own, at[piece], slope[piece])
-            if not visible[piece].all():
-                x[~visible[piece]] = y[~visible[piece]] = 0
+            there = visible[piece]
+            if not there.all():  # another's place: no other part of the image is to be interpolated
+                x[~there], y[~there] = x[there.argmax()], y[there.argmax()]
             parts.append(patches.compare(self._images[k].sample(x, y), own))
         rho, gx, gy = (np.concatenate(a) for a in zip(*((rho, *both) for rho, both in parts)))
         return rho, (gx, gy)

@@ -292,7 +292,8 @@ class _Growth:
             cells.attempts[front.cell] += 1
             cells.tried[front.cell] = True
             xy = self._grid.xy(front.cell)
-            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs)
+            again = this.matching.constraint != "none"  # each point is measured again (`constraints`)
+            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs, approximate=again)
             good = self._acceptable(measured, front.parent_depth_m, this.views.required_matches(this.pairs))
             front = front.select(good)
             cells.accept(front, measured.select(good), this.views)
@@ -368,11 +369,20 @@ def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Fr
     return Front(cell=cell, start=start, shape=seeds.shape[first], parent_depth_m=np.full(len(cell), np.nan))
 
 
-def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSettings, rig_sigma_px: float, *, pairs: bool) -> _Measured:
+def _measure(
+    views: Views,
+    xy: np.ndarray,
+    front: Front,
+    matching: MatchingSettings,
+    rig_sigma_px: float,
+    *,
+    pairs: bool,
+    approximate: bool = False,
+) -> _Measured:
     """Match a front's points `xy` (n, 2) in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     template = TemplatePoints(image=views.template, xy=xy, row_step=views.rows.step)
     searches = [SearchImage(image=views.images[k], start=front.start[:, k], shape=front.shape[:, k]) for k in views.search]
-    matched = match_patches(template, searches, matching)
+    matched = match_patches(template, searches, matching, required=views.required_matches(pairs) if approximate else 0)
     image_xy = np.full((len(xy), len(views.cameras), 2), np.nan)
     rig = np.diag([1.0, 1 / views.rows.step**2]) * rig_sigma_px**2
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(views.cameras), 1, 1))
