@@ -1,4 +1,4 @@
-"""The frames of one take on several processes: the starts of all frames one after the other, then the frames themselves at once.
+"""The frames of one take on several processes: the starts of all frames one after the other, and meanwhile the frames that have theirs.
 
 A frame's surface depends on its start alone (surface/starts.py), and workers leave what they measured as checkpoints, so the result has the
 same bytes for any number of workers, and a stopped run resumes.
@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -52,13 +52,22 @@ def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
         return
     steps = 1 + len(starts.order)
     next(measure_frames(footage, settings, run.results, monitor.part("seeds", 0, steps)))  # fails early where nothing can be measured
-    keys = {frame: starts.at(frame, monitor.part("seeds", 1 + done, steps))[0].key for done, frame in enumerate(starts.order)}
-    missing = {frame: key for frame, key in keys.items() if run.results.load_checkpoint("surface", f"{frame:04d}", key) is None}
-    if engine.scheduler is None and len(missing) < FEWEST:
-        return
-    with _running(engine, [_task(run, part) for part in _pieces(missing)]) as work:
-        for done, total in work:
-            monitor.step("surface", done, total)
+    waiting, least = list[tuple[int, str]](), FEWEST if engine.scheduler is None else 1
+    with _running(engine) as submit:
+        work = list[Any]()
+        for done, frame in enumerate(starts.order):
+            key = starts.at(frame, monitor.part("seeds", 1 + done, steps))[0].key
+            if run.results.load_checkpoint("surface", f"{frame:04d}", key) is None:
+                waiting.append((frame, key))
+            if len(waiting) >= least:
+                least = PIECE
+                while len(waiting) >= PIECE:  # always the same frames, whatever the number of workers
+                    work.append(submit(_task(run, dict(waiting[:PIECE]))))
+                    del waiting[:PIECE]
+        if waiting and least == PIECE:
+            work.append(submit(_task(run, dict(waiting))))
+        for finished in _finished(work):
+            monitor.step("surface", finished, len(work))
 
 
 def run_piece(task: Task) -> None:
@@ -89,25 +98,23 @@ def _task(run: Run, keys: Mapping[int, str]) -> Task:
     }
 
 
-def _pieces(keys: Mapping[int, str]) -> list[dict[int, str]]:
-    """PIECE frames at a time, whatever the number of workers."""
-    rows = list(keys.items())
-    return [dict(rows[i : i + PIECE]) for i in range(0, len(rows), PIECE)]
-
-
 @contextmanager
-def _running(engine: Engine, tasks: Sequence[Task]) -> Iterator[Iterator[tuple[int, int]]]:
-    """Run tasks; the iterator gives how many are finished, and of how many, until all are. Leaving early stops the workers."""
+def _running(engine: Engine) -> Iterator[Callable[[Task], Any]]:
+    """A function that hands a task to the workers and gives its future. Leaving stops the workers."""
+    futures = list[Any]()
     if engine.scheduler is not None:
         with dask_client(engine) as client:
-            futures = [client.submit(run_piece, task, pure=False, retries=engine.retries) for task in tasks]
+
+            def send(task: Task) -> Any:
+                futures.append(client.submit(run_piece, task, pure=False, retries=engine.retries))
+                return futures[-1]
+
             try:
-                yield _finished(futures)
+                yield send
             finally:
                 client.cancel(futures)
         return
-    workers = [_Worker(engine) for _ in range(min(engine.workers, len(tasks)))]
-    idle = SimpleQueue[_Worker]()
+    workers, idle = [_Worker(engine) for _ in range(engine.workers)], SimpleQueue[_Worker]()
     for worker in workers:
         idle.put(worker)
 
@@ -118,24 +125,28 @@ def _running(engine: Engine, tasks: Sequence[Task]) -> Iterator[Iterator[tuple[i
         finally:
             idle.put(worker)
 
-    with ThreadPoolExecutor(max(1, len(workers))) as pool:
-        local = [pool.submit(run, task) for task in tasks]
+    with ThreadPoolExecutor(len(workers)) as pool:
+
+        def start(task: Task) -> Any:
+            futures.append(pool.submit(run, task))
+            return futures[-1]
+
         try:
-            yield _finished(local)
+            yield start
         finally:
-            for future in local:
+            for future in futures:
                 future.cancel()
             for worker in workers:
                 worker.stop()
 
 
-def _finished(futures: Sequence[Any]) -> Iterator[tuple[int, int]]:
-    """How many of the futures are finished, again and again; raises what a worker raised."""
+def _finished(futures: Sequence[Any]) -> Iterator[int]:
+    """How many of the futures are finished, again and again until all are; raises what a worker raised."""
     while True:
         done = [future for future in futures if future.done()]
         for future in done:
             future.result()
-        yield len(done), len(futures)
+        yield len(done)
         if len(done) == len(futures):
             return
         time.sleep(WAIT_S)
