@@ -239,6 +239,32 @@ def bone_frames(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarray) -
     return _forward(skeleton, lengths_m, motion)[:2]
 
 
+def frames_of_bones(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarray, bones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`bone_frames` of some bones (K,) in N poses (N, D) that differ in few DOFs: R (N, K, 3, 3) and heads (N, K, 3).
+
+    What all poses have in common is computed once, and other bones than these and those that carry them are left out.
+    """
+    n = len(skeleton.base_dofs)
+    varies, turns = (motion != motion[:1]).any(axis=0), _turns(skeleton, motion)
+    base = motion[:, :n] if varies[:n].any() else motion[:1, :n]
+    frames: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # of one pose where all are the same
+    for b in np.flatnonzero(skeleton.ancestors[bones].any(axis=0)).tolist():
+        p = skeleton.parents[b]
+        if p < 0:
+            frame, head = skeleton.bones[b].R_rest[None], base
+        else:
+            R, head = frames[p]
+            frame = R @ skeleton.rest_to_parent[b]
+            head = head + (lengths_m[p] * R[:, :, 1] if skeleton.starts_at_tail[b] else 0.0)
+        for dof, _ in skeleton.turn_order[b]:
+            frame = frame @ (turns[:, dof] if varies[dof] else turns[:1, dof])
+        frames[b] = frame, head
+    R, head = np.empty((len(motion), len(bones), 3, 3)), np.empty((len(motion), len(bones), 3))
+    for i, b in enumerate(bones.tolist()):
+        R[:, i], head[:, i] = frames[b]
+    return R, head
+
+
 def frames_and_axes(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`bone_frames` and the DOFs' axes in the world (…, D, 3): the rotation axis a_k, or the direction in which a base DOF shifts.
 

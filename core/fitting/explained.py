@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..body.skeleton import bone_frames
+from ..body.skeleton import bone_frames, frames_of_bones
 from ..geometry.camera import Camera
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
@@ -146,7 +146,8 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
     """(2) of a whole body with the shape vector (S,) in N poses (N, D)."""
     state = parameters.state(poses[0], vector)
     R, head = bone_frames(parameters.skeleton, state.lengths_m, poses)
-    body = _Capsules.of(evidence, state, np.array(sorted(state.profiles)), free_bones(parameters), head, R)
+    bones = np.array(sorted(state.profiles))
+    body = _Capsules.of(evidence, state, bones, free_bones(parameters), head[:, bones], R[:, bones])
     return _explained_by(evidence, body, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
 
 
@@ -161,7 +162,7 @@ def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, widt
     middle = state.head_m[bones].mean(axis=0)
     shares = [_cells_explained(view, state, bones, evidence.reach, width_m) for view in evidence.cells]
     area = sum(evidence.cell_area(view, middle) * float(share.sum()) for view, share in zip(evidence.cells, shares))
-    body = _Capsules.of(evidence, state, bones, posed, state.head_m[None], state.R[None])
+    body = _Capsules.of(evidence, state, bones, posed, state.head_m[None, bones], state.R[None, bones])
     return area - float(_misplaced(evidence, body, state, np.zeros(0, np.intp))[0])
 
 
@@ -177,10 +178,10 @@ class _Capsules:
 
     @staticmethod
     def of(evidence: Evidence, state: BodyState, bones: np.ndarray, posed: np.ndarray, head: np.ndarray, R: np.ndarray) -> "_Capsules":
-        """Bones (K,) of a body in poses with the frames `head` (N, B, 3) and R (N, B, 3, 3); `posed` (B,)."""
+        """Bones (K,) of a body, their frames `head` (N, K, 3) and R (N, K, 3, 3) in N poses; `posed` (B,)."""
         return _Capsules(
-            first_m=head[:, bones],
-            axis=R[:, bones][..., 1],
+            first_m=head,
+            axis=R[..., 1],
             length_m=state.lengths_m[bones] * evidence.reach[bones],
             radii_m=np.array([[state.profiles[b].radii_m[i].mean() for i in (0, -1)] for b in bones.tolist()]),
             posed=posed[bones],
@@ -193,7 +194,7 @@ class _Capsules:
 
 def _limb_capsules(evidence: Evidence, limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
     bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
-    R, head = bone_frames(limb.parameters.skeleton, state.lengths_m, poses)
+    R, head = frames_of_bones(limb.parameters.skeleton, state.lengths_m, poses, bones)
     return _Capsules.of(evidence, state, bones, free_bones(limb.parameters), head, R)
 
 
@@ -293,7 +294,7 @@ def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others
     wrong = np.zeros(shape)
     for view in evidence.cells:
         depth = view.camera.to_camera(flat)[:, 2]
-        d, _ = view.distance.sampled(np.nan_to_num(view.camera.project(flat), nan=-1.0))
+        d = view.distance.values(np.nan_to_num(view.camera.project(flat), nan=-1.0))
         wrong += np.minimum((d * depth / view.camera.focal_px).reshape(shape) / radius, 1.0) / len(evidence.cells)
     if evidence.depths is not None:
         wrong += evidence.depths.far_behind(flat).reshape(shape)

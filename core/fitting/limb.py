@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..body.skeleton import bone_frames
+from ..body.skeleton import frames_of_bones
 from .state import ShapeParameters, free_bones
 
 
@@ -57,8 +57,8 @@ class Limb:
     def ends(self, poses: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """The tails (N, E, 3) of its bones in poses (N, D), of a body with the shape vector (S,)."""
         lengths = self.parameters.body(vector)[0]
-        R, head = bone_frames(self.parameters.skeleton, lengths, poses)
-        return np.asarray(head[:, self.bones] + lengths[self.bones, None] * R[:, self.bones][..., 1])
+        R, head = frames_of_bones(self.parameters.skeleton, lengths, poses, self.bones)
+        return np.asarray(head + lengths[self.bones, None] * R[..., 1])
 
 
 def limbs_of(parameters: ShapeParameters) -> dict[int, Limb]:

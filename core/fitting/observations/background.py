@@ -29,15 +29,26 @@ class DistanceMap:
 
     def sampled(self, xy_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """d (N,) and its gradient (N, 2) at pixels (N, 2), bilinear; 0 outside the image, where nothing is known."""
-        h, w = self.values_px.shape
-        at = (xy_px - self.first_px) / self.step_px
-        inside = (at >= 0).all(axis=1) & (at[:, 0] < w - 1) & (at[:, 1] < h - 1)
-        i, j = np.where(inside[:, None], at, 0.0).astype(np.intp).T
-        fx, fy = np.where(inside[:, None], at, 0.0).T - (i, j)
-        a, b, c, e = (self.values_px[j + dj, i + di].astype(np.float64) for dj, di in ((0, 0), (0, 1), (1, 0), (1, 1)))
+        (a, b, c, e), (fx, fy), inside = self._around(xy_px)
         value = (1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * e)
         gradient = np.stack([(1 - fy) * (b - a) + fy * (e - c), (1 - fx) * (c - a) + fx * (e - b)], axis=1) / self.step_px
         return value * inside, gradient * inside[:, None]
+
+    def values(self, xy_px: np.ndarray) -> np.ndarray:
+        """d (N,) of `sampled` without the gradient."""
+        (a, b, c, e), (fx, fy), inside = self._around(xy_px)
+        return np.asarray(((1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * e)) * inside)
+
+    def _around(self, xy_px: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """d at the four nodes about each of N pixels, the pixel's fractions between them, and whether it is inside the image."""
+        h, w = self.values_px.shape
+        x, y = ((xy_px[:, i] - self.first_px) / self.step_px for i in range(2))
+        inside = (x >= 0) & (y >= 0) & (x < w - 1) & (y < h - 1)
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+        i, j = x.astype(np.intp), y.astype(np.intp)
+        at, flat = j * w + i, self.values_px.reshape(-1)
+        corners = tuple(flat.take(at + d).astype(np.float64) for d in (0, 1, w, w + 1))
+        return corners, (x - i, y - j), inside
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import mirrored, model_names, other_side, read_model, without
-from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, joint_positions
+from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, frames_of_bones, joint_positions
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rotation import axis_rotation
 
@@ -90,6 +90,17 @@ def test_many_postures_at_once_are_the_postures_one_by_one() -> None:
     R, head = bone_frames(skeleton, _lengths(skeleton), motions)
     one = bone_frames(skeleton, _lengths(skeleton), motions[1, 2])
     assert np.allclose(R[1, 2], one[0]) and np.allclose(head[1, 2], one[1])
+
+
+def test_some_bones_are_where_they_are_among_all() -> None:
+    """Also if the poses differ in the bones before these, or in the place of the body."""
+    skeleton = read_model("full").skeleton
+    lengths, bones = _lengths(skeleton), np.flatnonzero([bone.name in ("forearm.R", "hand.R") for bone in skeleton.bones])
+    for columns in (["elbow.R flexion"], ["elbow.R flexion", "shoulder.R twist"], ["pelvis x"]):
+        motion = np.tile(RNG.normal(0, 0.5, len(skeleton.dof_names)), (5, 1))
+        motion[:, [skeleton.layout[name] for name in columns]] += RNG.normal(0, 0.5, (5, len(columns)))
+        for some, every in zip(frames_of_bones(skeleton, lengths, motion, bones), bone_frames(skeleton, lengths, motion)):
+            assert np.array_equal(some, every[:, bones])
 
 
 def test_a_whole_body_is_its_own_mirror_image() -> None:
