@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..body.skeleton import bone_frames, frames_of_bones
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
@@ -28,6 +29,7 @@ COARSE = 3  # points and cells as one, for a first choice among many poses
 CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of measured points
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
 BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
+LARGEST, SHARED_FROM = 256, 64  # poses evaluated at once, and from which on threads share them
 FAR = 4.0  # widths, from where on nothing is explained
 EXPLAINED = 0.95  # of a point or cell: no limb is looked for there
 FACING = 0.3  # least cosine between a point's normal and the limb's
@@ -138,8 +140,13 @@ class Evidence:
 def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
     """(2) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
     state = limb.parameters.state(poses[0], vector)
-    capsules = _limb_capsules(evidence, limb, poses, state)
-    return _explained_by(evidence, capsules, width_m) - _misplaced(evidence, capsules, state, _others(limb, state))
+    others = _others(limb, state)
+
+    def gains(rows: slice) -> np.ndarray:
+        capsules = _limb_capsules(evidence, limb, poses[rows], state)
+        return _explained_by(evidence, capsules, state, width_m) - _misplaced(evidence, capsules, state, others)
+
+    return np.concatenate(in_threads(gains, equal_pieces(len(poses), LARGEST, SHARED_FROM)))
 
 
 def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
@@ -148,7 +155,7 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
     R, head = bone_frames(parameters.skeleton, state.lengths_m, poses)
     bones = np.array(sorted(state.profiles))
     body = _Capsules.of(evidence, state, bones, free_bones(parameters), head[:, bones], R[:, bones])
-    return _explained_by(evidence, body, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
+    return _explained_by(evidence, body, state, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
 
 
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
@@ -170,6 +177,7 @@ def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, widt
 class _Capsules:
     """K bones in N poses as tapered capsules."""
 
+    bones: np.ndarray  # (K,)
     first_m: np.ndarray  # (N, K, 3)
     axis: np.ndarray  # (N, K, 3) unit
     length_m: np.ndarray  # (K,)
@@ -180,6 +188,7 @@ class _Capsules:
     def of(evidence: Evidence, state: BodyState, bones: np.ndarray, posed: np.ndarray, head: np.ndarray, R: np.ndarray) -> "_Capsules":
         """Bones (K,) of a body, their frames `head` (N, K, 3) and R (N, K, 3, 3) in N poses; `posed` (B,)."""
         return _Capsules(
+            bones=bones,
             first_m=head,
             axis=R[..., 1],
             length_m=state.lengths_m[bones] * evidence.reach[bones],
@@ -203,11 +212,11 @@ def _others(limb: Limb, state: BodyState) -> np.ndarray:
     return np.array([b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer], dtype=np.intp)
 
 
-def _explained_by(evidence: Evidence, capsules: _Capsules, width_m: float) -> np.ndarray:
-    """The first sum of (2) for capsules in N poses (N,)."""
+def _explained_by(evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float) -> np.ndarray:
+    """The first sum of (2) for capsules in N poses (N,); a cell's area is that at the first of them in one `state`."""
     gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
     for view, share in zip(evidence.cells, evidence.taken_cells):
-        gain += evidence.cell_area(view, capsules.first_m[0, 0]) * _gain_of_cells(view, capsules, share, width_m)
+        gain += evidence.cell_area(view, state.head_m[capsules.bones[0]]) * _gain_of_cells(view, capsules, share, width_m)
     return gain
 
 

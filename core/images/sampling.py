@@ -44,6 +44,7 @@ class SplineImage:
         self._wide = cv2.copyMakeBorder(grey, MARGIN, MARGIN + TILE, MARGIN, MARGIN + TILE, cv2.BORDER_REFLECT_101)
         self._fine = np.zeros(((h - 1) * FINENESS + 1, (w - 1) * FINENESS + 1), np.float32)  # takes memory where a tile is written
         self._ready = np.zeros((-(-h // TILE), -(-w // TILE)), dtype=bool)
+        self._ready_about = np.zeros((2 * self._ready.shape[0], 2 * self._ready.shape[1]), dtype=bool)  # half tiles, and those around them
         self._pixels: np.ndarray | None = None  # (3, h, w) grey values and gradients, on request
 
     @cached_property
@@ -78,8 +79,7 @@ class SplineImage:
 
         `centre` (N, 2) and `shape` (N, 2, 2) in pixels; N and n stay below 32,767.
         """
-        reach = np.abs(shape) @ np.abs(basis[1:]).max(axis=1)
-        self._prepare((centre - reach).min(axis=0), (centre + reach).max(axis=0))
+        self._prepare_about(centre, np.abs(shape) @ np.abs(basis[1:]).max(axis=1))
         warp = np.empty((2, len(centre), 3), np.float32)
         warp[:, :, 0], warp[:, :, 1:] = FINENESS * centre.T, FINENESS * shape.transpose(1, 0, 2)
         x, y = (warp.reshape(-1, 3) @ basis).reshape(2, len(centre), -1)
@@ -105,10 +105,34 @@ class SplineImage:
         """Compute the tiles of the box from `low` to `high` (x, y), as far as they are not ready."""
         columns, rows = (_tiles(float(a), float(b), size) for a, b, size in zip(low, high, self.shape[::-1]))
         missing = ~self._ready[rows, columns]
-        if not missing.any():
+        if missing.any():
+            self._compute(np.argwhere(missing) + (rows.start, columns.start))
+
+    def _prepare_about(self, centre: np.ndarray, reach: np.ndarray) -> None:
+        """Compute the tiles of patches about `centre` (N, 2) that reach so far (N, 2), as far as they are not ready; none between them."""
+        h, w = self.shape
+        usual = (reach <= TILE / 2 - LOOK_UP_PX) & (centre >= 0) & (centre <= (w - 1, h - 1))
+        if not usual.all():
+            usual = usual.all(axis=1)
+            for low, high in zip(centre[~usual] - reach[~usual], centre[~usual] + reach[~usual]):
+                self._prepare(low, high)
+            centre = centre[usual]
+        i, j = (centre.T * (2 / TILE)).astype(np.intp)  # in half tiles: what a patch needs lies between half a tile before it and behind it
+        ready = self._ready_about[j, i]
+        if ready.all():
             return
+        i, j = i[~ready], j[~ready]
+        missing, (rows, columns) = np.zeros_like(self._ready), self._ready.shape
+        for r in ((j - 1) // 2, (j + 2) // 2, (j + 1) // 2):
+            for c in ((i - 1) // 2, (i + 2) // 2, (i + 1) // 2):
+                missing[np.clip(r, 0, rows - 1), np.clip(c, 0, columns - 1)] = True
+        self._compute(np.argwhere(missing & ~self._ready))
+        self._ready_about[j, i] = True
+
+    def _compute(self, tiles: np.ndarray) -> None:
+        """Compute tiles (n, 2) by row and column. Two threads may compute one, with the same values."""
         U = _interpolation()
-        for r, c in (np.argwhere(missing) + (rows.start, columns.start)).tolist():  # two threads may compute a tile, with the same values
+        for r, c in tiles.tolist():
             f = self._wide[r * TILE : (r + 1) * TILE + 2 * MARGIN, c * TILE : (c + 1) * TILE + 2 * MARGIN]
             target = self._fine[r * TILE * FINENESS :, c * TILE * FINENESS :][: TILE * FINENESS, : TILE * FINENESS]
             target[...] = (U @ f @ U.T)[: target.shape[0], : target.shape[1]]  # (1)

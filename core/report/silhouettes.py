@@ -26,12 +26,14 @@ from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import filled
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..foundation.threads import in_threads
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
 from ..take.footage import Footage
 
 OUTLINE, BACKGROUND = "outline", "background"
 MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second
+TOGETHER = 4  # frames whose silhouettes are in memory at once
 PERSON = {OUTLINE: "the person's outline", BACKGROUND: "the person in front of the background"}  # by source
 WHOLE_BODY = frozenset({"head", "forearm.L", "forearm.R", "shin.L", "shin.R"})  # bones; a model without one of them is a part of a body
 
@@ -83,11 +85,16 @@ def silhouettes_of(
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
     if not outlines and not backgrounds:
         return Silhouettes(whole=whole)
-    found, regions = [], {r.view: r for r in backgrounds}
-    for n, i in enumerate(chosen.tolist()):
+    found, regions = list[SilhouetteFit](), {r.view: r for r in backgrounds}
+
+    def masks_at(i: int) -> list[np.ndarray]:
+        return [] if monitor.cancelled else body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)
+
+    together = [chosen[n : n + TOGETHER] for n in range(0, len(chosen), TOGETHER)]
+    masked = ((int(i), masks) for some in together for i, masks in zip(some, in_threads(masks_at, some.tolist())))
+    for n, (i, masks) in enumerate(masked):
         monitor.step("silhouettes", n, len(chosen))
         frame = int(frames[i])
-        masks = body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)
         for camera, mask in zip(footage.rig.cameras, masks):
             polygon = outlines.get(camera.name, {}).get(frame)
             if polygon is not None:

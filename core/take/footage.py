@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ..foundation.errors import InputError
+from ..foundation.threads import in_threads
 from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
 from ..images.retime import Recent
@@ -61,7 +62,7 @@ class Footage:
         Raises:
             InputError: an image is missing, damaged, or of another size than its camera.
         """
-        return self._checked(frame, [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)])
+        return self._checked(frame, in_threads(lambda k: self.sequences[k].read(self.number(k, frame)), range(len(self.sequences))))
 
     def read_colour(self, frame: int) -> list[np.ndarray]:
         """The RGB images (h, w, 3) float32 of all views at one frame of the take; the rows of the other field are interpolated.
@@ -69,7 +70,8 @@ class Footage:
         Raises:
             InputError: as `read`.
         """
-        images = self._checked(frame, [s.read_colour(self.number(k, frame)) for k, s in enumerate(self.sequences)])
+        views = range(len(self.sequences))
+        images = self._checked(frame, in_threads(lambda k: self.sequences[k].read_colour(self.number(k, frame)), views))
         return [self.take.rows_at(frame).whole(image) for image in images]
 
     def _checked(self, frame: int, images: list[np.ndarray]) -> list[np.ndarray]:

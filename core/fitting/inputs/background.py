@@ -12,6 +12,7 @@ like the background where they were clicked: such a limb stands still, and the b
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from ...body.model_file import read_model
 from ...body.skeleton import Skeleton
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
+from ...foundation.threads import in_threads
 from ...geometry.camera import Camera
 from ...geometry.intersection import intersect_clicks
 from ...geometry.rig import Rig
@@ -137,23 +139,27 @@ def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Mon
     limits = {k: cells(_mask_of(footage, k, int(frames[0])), sizes[k]) > 0 for k in known if footage.take.views[k].mask is not None}
     persons = _clicked_limbs(footage, known, clouds, frames.tolist())
     found = {k: Packed() for k in sorted({*known, *masked})}
+
+    def distances(cloud: PointCloud, images: Sequence[np.ndarray], k: int) -> np.ndarray:
+        camera, size = footage.rig.cameras[k], sizes[k]
+        if k in known:
+            image = cells(images[k], size)
+            seen = _near(camera, cloud.xyz_m, image.shape, size, CELL_M)
+            shown = person(known[k], image, seen)
+            shown = np.ones(image.shape, dtype=bool) if shown is None else (shown | seen | persons[k]) & limits.get(k, True)
+        else:
+            shown = cells(_mask_of(footage, k, cloud.frame), size) > HALF
+        unknown = (known[k].known == 0) & ~shown if k in known else np.zeros(shown.shape, dtype=bool)
+        beyond = (~(shown | unknown)).astype(np.uint8)
+        far = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
+        steps = np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)
+        return np.where(unknown, 1, steps).astype(np.uint8)  # next to the person: neither that nor background
+
     for t, cloud in enumerate(clouds):
         monitor.step("background", t, len(clouds))
         images = footage.read(cloud.frame) if known else []
-        for k, distances in found.items():
-            camera, size = footage.rig.cameras[k], sizes[k]
-            if k in known:
-                image = cells(images[k], size)
-                seen = _near(camera, cloud.xyz_m, image.shape, size, CELL_M)
-                shown = person(known[k], image, seen)
-                shown = np.ones(image.shape, dtype=bool) if shown is None else (shown | seen | persons[k]) & limits.get(k, True)
-            else:
-                shown = cells(_mask_of(footage, k, cloud.frame), size) > HALF
-            unknown = (known[k].known == 0) & ~shown if k in known else np.zeros(shown.shape, dtype=bool)
-            beyond = (~(shown | unknown)).astype(np.uint8)
-            far = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
-            steps = np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)
-            distances.append(np.where(unknown, 1, steps).astype(np.uint8))  # next to the person: neither that nor background
+        for k, of_view in zip(found, in_threads(partial(distances, cloud, images), [*found])):
+            found[k].append(of_view)
     views = footage.take.views
     return [BackgroundDistances(view=views[k].name, frame=frames, distance=d, step_px=sizes[k], unit_px=UNIT_PX) for k, d in found.items()]
 
@@ -189,28 +195,28 @@ def _backgrounds(
     footage: Footage, clouds: Sequence[PointCloud], chosen: Sequence[int], sizes: Sequence[int], monitor: Monitor
 ) -> list[CellBackground | None]:
     """The background of every view: the user's image of it, or what stays the same in the chosen frames; None where they are too few."""
-    found = list[CellBackground | None]()
-    points = [clouds[t].xyz_m for t in chosen]
-    footage.read(clouds[chosen[0]].frame)  # of the cameras' size
-    for k, (camera, view, size) in enumerate(zip(footage.rig.cameras, footage.take.views, sizes)):
-        monitor.step("background", k, len(sizes))
+    points, numbers = [clouds[t].xyz_m for t in chosen], [clouds[t].frame for t in chosen]
+    footage.read(numbers[0])  # of the cameras' size
+
+    def background(k: int) -> CellBackground | None:
+        camera, view, size = footage.rig.cameras[k], footage.take.views[k], sizes[k]
         if view.background is None and (_has_silhouettes(footage, k) or len(chosen) < FEWEST):
-            found.append(None)
-            continue
+            return None
         images = []
-        for t in chosen:
+        for frame in numbers:
             monitor.check()
-            images.append(cells(footage.sequences[k].read(footage.number(k, clouds[t].frame)), size))
+            images.append(cells(footage.sequences[k].read(footage.number(k, frame)), size))
         if view.background is not None:
-            found.append(_given_background(footage, k, images, size))
-            continue
+            return _given_background(footage, k, images, size)
         everywhere = any(map(len, points))  # a frame without points does not show where the person is
         near = [
             _near(camera, xyz_m, images[0].shape, size, NEAR_M) if len(xyz_m) else np.full(images[0].shape, everywhere) for xyz_m in points
         ]
         seen = [_near(camera, xyz_m, images[0].shape, size, CELL_M) for xyz_m in points]
-        found.append(still_background(images, near, seen, size))
-    return found
+        return still_background(images, near, seen, size)
+
+    monitor.step("background", 0, len(clouds))
+    return in_threads(background, range(len(sizes)))
 
 
 def _given_background(footage: Footage, k: int, images: Sequence[np.ndarray], size: int) -> CellBackground:
