@@ -19,7 +19,32 @@ def test_only_the_tiles_that_are_sampled_are_computed() -> None:
     image.sample(np.full((1, 1), 3.0, np.float32), np.full((1, 1), TILE + 3.0, np.float32))
     assert image._ready.sum() == 1 and image._ready[1, 0]
     image.sample_patches(np.array([[TILE - 2.0, 5.0]]), np.eye(2)[None], np.array([[1, 1], [-3, 3], [-3, 3]], dtype=np.float32))
-    assert image._ready.sum() == 3
+    assert image._ready.sum() == 4 and image._ready[:2, :2].all()
+
+
+def test_no_tiles_are_computed_between_patches() -> None:
+    image, basis = SplineImage(np.zeros((200, 200), np.float32)), np.array([[1, 1], [-6, 6], [-6, 6]], dtype=np.float32)
+    far_apart, shapes = np.array([[8.0, 8.0], [190.0, 190.0], [100.0, 100.0]]), np.stack([np.eye(2), np.eye(2), 4 * np.eye(2)])
+    image.sample_patches(far_apart[:2], shapes[:2], basis)
+    assert image._ready.sum() == 8
+    image.sample_patches(far_apart, shapes, basis)  # one that is larger than usual
+    assert image._ready[2:4, 2:4].all() and image._ready.sum() == 12
+
+
+def test_patches_have_the_values_of_the_whole_spline() -> None:
+    """Wherever they are and however large, inside the image or across its border."""
+    rng, basis = (
+        np.random.default_rng(1),
+        np.mgrid[:1, -8:9, -8:9].reshape(3, -1).astype(np.float32) + np.array([[1], [0], [0]], np.float32),
+    )
+    for size in (0.1, 0.8):
+        parts, whole = SplineImage(IMAGE), SplineImage(IMAGE)
+        whole.sample(*every_pixel())
+        centre, shape = (
+            rng.uniform((-5, -5), (IMAGE.shape[1] + 5, IMAGE.shape[0] + 5), (40, 2)),
+            np.eye(2) + rng.normal(0, size, (40, 2, 2)),
+        )
+        assert np.array_equal(parts.sample_patches(centre, shape, basis), whole.sample_patches(centre, shape, basis))
 
 
 def test_the_order_changes_no_bit() -> None:
