@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..foundation.progress import Monitor
+from ..foundation.threads import in_threads
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
@@ -178,13 +179,16 @@ def _attempt(
     n, K = len(points.identity), len(view.cameras)
     status = np.where(np.isfinite(points.xy).all(axis=2), TrackStatus.MEASURED, TrackStatus.ABSENT).astype(np.int8)
     start = np.empty((n, K, 2))
-    for k, camera in enumerate(view.cameras):
-        centre = view.rows.from_frame(camera.project(predicted))
+
+    def search(k: int) -> None:
+        centre = view.rows.from_frame(view.cameras[k].project(predicted))
         start[:, k], correlation = search_box(
             images.grey[k], images.next_grey[k], points.xy[:, k], centre, box, view.matching.patch_px, view.rows.step
         )
         mark(status[:, k], ~images.next_spline[k].inside(centre, 1.0), TrackStatus.LEFT_IMAGE)
         mark(status[:, k], correlation < view.tracking.min_correlation, TrackStatus.NOT_FOUND)
+
+    in_threads(search, range(K))
     temporal = match_temporally(view, points, start, images, status)
     points, temporal = control(view, points, temporal, templates, images.next_spline[view.reference], status[:, view.reference])
     spatial = match_spatially(view, points, [m.xy for m in temporal], images.next_spline, status)
@@ -201,14 +205,15 @@ def mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
 def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
     """The patch of frame i matched in frame i + 1, per view.  (3)"""
     eye = np.tile(np.eye(2), (len(start), 1, 1))
-    matches = []
-    for k in range(len(view.cameras)):
+
+    def match(k: int) -> Matches:
         begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
         template = TemplatePoints(image=images.spline[k], xy=points.xy[:, k], row_step=view.rows.step, texture_centre=False)
         m = match_patches(template, [SearchImage(image=images.next_spline[k], start=begin, shape=eye)], view.matching)[0]
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
-        matches.append(m)
-    return matches
+        return m
+
+    return in_threads(match, range(len(view.cameras)))
 
 
 def control(
