@@ -7,17 +7,18 @@ import sys
 from ..foundation import bounded
 from ..foundation.errors import InputError
 from ..foundation.threads import one_thread_in_linear_algebra
-from ..run.workers import run_piece
+from ..run.workers import Pieces
 
 
 def main() -> None:
     """Do the tasks until the input ends. A bug ends the process with its traceback."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print
+    pieces = Pieces()
     with one_thread_in_linear_algebra():
         for line in sys.stdin:
             try:
-                run_piece(bounded.json_of(line))
+                pieces.run(bounded.json_of(line))
                 answer = {}
             except InputError as error:
                 answer = {"error": str(error)}

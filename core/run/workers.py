@@ -24,7 +24,7 @@ from ..results.folder import Results
 from ..surface.measure import measure_frames, measure_piece
 from ..surface.resolution import measured_footage
 from ..surface.starts import FrameStarts, MeasureSettings
-from ..take.footage import open_take
+from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from .engine import Engine, dask_client, python_command, thread_limits
 from .settings import SETTINGS
@@ -70,20 +70,36 @@ def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
             monitor.step("surface", finished, len(work))
 
 
-def run_piece(task: Task) -> None:
-    """The task of a worker: measure its frames.
+class Pieces:
+    """Measures the frames of one task after the other. The footage stays open from task to task: a movie is decoded from its beginning."""
 
-    Raises:
-        InputError: see `measure_piece`.
-    """
-    settings: dict[str, Any] = {name: from_table(kind, task["settings"][name], f"[{name}]") for name, kind in SETTINGS.items()}
+    def __init__(self) -> None:
+        self._opened: tuple[Any, Footage] | None = None
+
+    def run(self, task: Task) -> None:
+        """The task of a worker: measure its frames.
+
+        Raises:
+            InputError: see `measure_piece`.
+        """
+        settings: dict[str, Any] = {name: from_table(kind, task["settings"][name], f"[{name}]") for name, kind in SETTINGS.items()}
+        same = [task[name] for name in ("take", "frames", "delay_images", "settings")]
+        if self._opened is None or self._opened[0] != same:
+            self._opened = same, _opened(task, settings)
+        keys = {int(frame): key for frame, key in task["keys"].items()}
+        measure_piece(self._opened[1], MeasureSettings.of(settings), Results(Path(task["out"])), keys, Monitor())
+
+
+def run_piece(task: Task) -> None:
+    """A single task; see `Pieces.run`."""
+    Pieces().run(task)
+
+
+def _opened(task: Task, settings: Mapping[str, Any]) -> Footage:
     take = read_take(Path(task["take"]))
     footage = only_frames(open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), (task["frames"][0], task["frames"][1]))
-    footage = measured_footage(
-        replace(footage, delay_images=tuple(task["delay_images"])), settings["surface"].quality, settings["growing"].spacing_px
-    )
-    keys = {int(frame): key for frame, key in task["keys"].items()}
-    measure_piece(footage, MeasureSettings.of(settings), Results(Path(task["out"])), keys, Monitor())
+    footage = replace(footage, delay_images=tuple(task["delay_images"]))
+    return measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
 
 
 def _task(run: Run, keys: Mapping[int, str]) -> Task:

@@ -63,7 +63,7 @@ def test_what_a_worker_refuses_is_said_in_one_sentence(plane_take: Path, tmp_pat
         return task(run, keys)
 
     monkeypatch.setattr(workers, "_task", without_image)
-    with pytest.raises(InputError, match="View L lacks the image"):
+    with pytest.raises(InputError, match="View L lacks the image|0002.png"):
         measured(take, tmp_path / "out", TWO)
 
 
@@ -91,3 +91,18 @@ def test_a_task_is_plain_text(plane_take: Path, tmp_path: Path) -> None:
     with take_run.open_run(plane_take, tmp_path / "out", {"matching": {"patch_px": 15}}) as job:
         task = workers._task(job, {3: "key"})
     assert json.loads(json.dumps(task)) == task and task["settings"]["matching"]["patch_px"] == 15 and task["keys"] == {"3": "key"}
+
+
+def test_footage_stays_open_from_task_to_task(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A movie is decoded from its beginning: opened anew for every task, a long one would never end."""
+    opened, open_take = list[Any](), workers.open_take
+    monkeypatch.setattr(workers, "open_take", lambda *a, **k: opened.append(a) or open_take(*a, **k))
+    monkeypatch.setattr(workers, "measure_piece", lambda *a: None)
+    with take_run.open_run(plane_take, tmp_path / "out") as job:
+        tasks = [workers._task(job, {frame: "key"}) for frame in (0, 1)]
+    with take_run.open_run(plane_take, tmp_path / "other", {"matching": {"patch_px": 15}}) as job:
+        tasks.append(workers._task(job, {2: "key"}))
+    pieces = workers.Pieces()
+    for task, count in zip(tasks, (1, 1, 2)):
+        pieces.run(task)
+        assert len(opened) == count
