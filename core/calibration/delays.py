@@ -23,6 +23,7 @@ NEAR = 2  # images: the nearest on each side
 SEARCHED = np.arange(-8.0, 8.01, 0.5)  # images, of (3)
 REFINED = np.arange(-0.5, 0.51, 0.1)
 NEARBY = 0.2  # images: where neither this delay nor its opposite fits better than none, no other is tried
+FITS = 0.3  # of WIDTH: a board that fits less well at once may be many images apart, and all delays are tried
 CLEAR = 0.7  # of the distance without a delay: what fits less well is none
 WIDTH = 0.01  # of the image width: points further from their line count as that far
 SEARCH_POSITIONS = 200
@@ -30,6 +31,7 @@ ITERATIONS = 500
 JUMP = 8.0  # times the median: further from the path through its neighbours, a point is wrong
 JUMP_ROUNDS = 4
 FEWEST_POINTS = 24  # of a pair of cameras
+LEAST_SHARE = 0.4  # of the positions that the pair shares at once: fewer fit by chance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -70,6 +72,27 @@ class MovingPoints:
         order = np.argsort(self.frames, kind="stable")
         at = order[np.minimum(np.searchsorted(self.frames, self.frames + whole, sorter=order), len(order) - 1)]
         return at, self.frames[at] == self.frames + whole
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PlacedPoints(MovingPoints):
+    """The same for N positions of which several may be of one frame; the frames of `frames` are different ones."""
+
+    of: np.ndarray  # (N,) indices of the frames
+    shown: np.ndarray  # (N, C) which cameras show the position
+
+    def at(self, delay_images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image points (N, C, K, 2) and their velocities."""
+        xy, velocity = MovingPoints.at(self, delay_images)
+        return np.where(self.shown[..., None, None], xy[self.of], np.nan), velocity[self.of]
+
+
+def placed_points(moving: MovingPoints, frames: np.ndarray, shown: np.ndarray) -> PlacedPoints:
+    """Moving points for positions in these frames (N,) that some cameras (N, C) show."""
+    of = np.searchsorted(moving.frames, frames)
+    return PlacedPoints(
+        frames=moving.frames, coefficients=moving.coefficients, expected_images=moving.expected_images, of=of, shown=shown
+    )  # fmt: skip
 
 
 def moving_points(frames: np.ndarray, xy_px: np.ndarray, expected_images: np.ndarray | None = None) -> MovingPoints:
@@ -137,7 +160,8 @@ def first_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> n
 def _delay_between(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], labelled: bool) -> float:
     """By how many images the second camera is later than the first."""
     at_once, earlier, later = (_distance(moving, size_px, pair, d, labelled) for d in (0.0, -NEARBY, NEARBY))
-    if at_once <= min(earlier, later):
+    bar = moving.coefficients.shape[3] == 2  # whose few points fit at many delays by chance
+    if at_once <= min(earlier, later) and (bar or at_once < FITS * WIDTH):
         return 0.0
     coarse = min(SEARCHED, key=lambda d: _distance(moving, size_px, pair, d, labelled))
     best = min(coarse + REFINED, key=lambda d: _distance(moving, size_px, pair, d, labelled))
@@ -152,7 +176,8 @@ def _distance(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], 
     xy = moving.at(delays)[0]
     some = np.flatnonzero(np.isfinite(xy[:, [i, j]]).all(axis=(1, 2, 3)))
     some = some[np.unique(np.linspace(0, max(len(some) - 1, 0), SEARCH_POSITIONS).astype(int))] if len(some) else some
-    if len(some) * xy.shape[2] < FEWEST_POINTS:
+    at_once = np.isfinite(moving.coefficients[0][:, [i, j]]).all(axis=(1, 2, 3)).sum()
+    if len(some) * xy.shape[2] < FEWEST_POINTS or len(some) < LEAST_SHARE * min(at_once, SEARCH_POSITIONS):
         return np.inf
     ni, nj = ((xy[some, c] - size_px[c] / 2) / size_px[i, 0] for c in pair)
     orders = (nj,) if labelled or xy.shape[2] != 2 else (nj, nj[:, ::-1])

@@ -47,14 +47,44 @@ def held_board(
     R = rotation_from_vector(axis * rng.uniform(0, tilt, (positions, 1)))
     R = R @ rotation_from_vector(rng.uniform(-np.pi, np.pi, (positions, 1)) * [0.0, 0.0, 1.0] * (tilt > 0))
     points = np.einsum("nij,kj->nki", R, corners_m) + t[:, None]
-    xy = np.stack([c.project(points) for c in cameras], axis=1)
+    return _observed(cameras, [points] * len(cameras), R, t, rng, sigma_px, gross)
+
+
+def waved_board(
+    cameras: Sequence[Camera],
+    corners_m: np.ndarray,
+    positions: int,
+    rng: np.random.Generator,
+    *,
+    delay_images: Sequence[float],
+    pace: float = 0.5,
+    sigma_px: float = 0.1,
+) -> HeldBoard:
+    """Wave a board smoothly through the volume; camera c takes its images `delay_images[c]` later. The truth is that of no delay."""
+    phase, rate = rng.uniform(0, 2 * np.pi, 6), np.array([0.18, 0.28, 0.13, 0.23, 0.17, 0.11]) * rng.uniform(0.85, 1.15, 6)
+    reach = np.maximum(VOLUME_SIZE_M / 2 - np.ptp(corners_m, axis=0).max() / 3, 0.05)
+
+    def pose(delay: float) -> tuple[np.ndarray, np.ndarray]:
+        wave = np.sin(rate * pace * (np.arange(positions) + delay)[:, None] + phase)
+        return rotation_from_vector(wave[:, 3:] * [TILT, TILT, 1.5]), VOLUME_CENTRE_M + wave[:, :3] * reach
+
+    taken = [np.einsum("nij,kj->nki", R, corners_m) + t[:, None] for R, t in map(pose, delay_images)]
+    return _observed(cameras, taken, *pose(0.0), rng, sigma_px, 0.0)
+
+
+def _observed(
+    cameras: Sequence[Camera], points_m: Sequence[np.ndarray], R: np.ndarray, t_m: np.ndarray, rng: np.random.Generator,
+    sigma_px: float, gross: float,
+) -> HeldBoard:  # fmt: skip
+    """What the cameras see of the corners (N, K, 3) that each of them has before it."""
+    xy = np.stack([c.project(points) for c, points in zip(cameras, points_m)], axis=1)
     inside = np.stack([c.sees(xy[:, i]) for i, c in enumerate(cameras)], axis=1)
     wrong = rng.random(inside.shape) < gross
     angle, far = rng.uniform(0, 2 * np.pi, inside.shape), rng.uniform(5, 200, inside.shape)
     xy = xy + rng.normal(0, sigma_px, xy.shape)
     xy += wrong[..., None] * far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     xy[~inside.all(axis=2)] = np.nan  # a chessboard must be visible as a whole
-    return HeldBoard(cameras=tuple(cameras), R=R, t_m=t, xy_px=xy, wrong=wrong)
+    return HeldBoard(cameras=tuple(cameras), R=R, t_m=t_m, xy_px=xy, wrong=wrong)
 
 
 def picture_of_board(

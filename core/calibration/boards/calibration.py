@@ -1,7 +1,9 @@
 """Self-calibration from image points of a board, with the adjustment, tests and selection of lens parameters of `self_calibration`.
 
+0  how late each camera is, roughly, if the board moved and the images fit one another better then (`delays`);
 1  initial values from nothing (`start`);
 2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly;
+   the delays of the cameras are unknowns from here on if they are significant;
 3  positions again with the cameras fixed: a view that does not fit the others was not synchronised, and becomes a position of its own;
 4  the shape of the board, if its deviations from the plan are significant: each corner is adjusted in space with the rest fixed, then the
    rest, several times; a shift, a turn and a scale of the whole are removed, so the squares keep their mean size
@@ -9,7 +11,7 @@
 5  least squares, data snooping, significance, precision as for a bar.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,12 +19,14 @@ from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...geometry.camera import INTERIOR, image_with_derivatives
 from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
+from ..delays import MovingPoints, PlacedPoints, first_delays, moving_points, placed_points
 from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
-from ..self_calibration import GROSS, Calibration, coarse_adjustment, robust_sigma, without_insignificant, without_outliers
+from ..self_calibration import GROSS, Calibration, coarse_adjustment, robust_sigma, with_delays, without_insignificant, without_outliers
 from .observations import BoardObservations
 from .start import FEWEST_SHARED, initial_network, without_wild
 
+DELAY_CORNERS = 8  # by which the first delays are found
 SHAPE_POSITIONS = 8  # of the board that show its shape
 SHAPE_ROUNDS = 6
 SHAPE_ALPHA = 1e-3  # α of (1)
@@ -47,7 +51,38 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
         InputError: a camera shares too few positions of the board with the others.
     """
     monitor.step("calibration", 0, 5)
-    started = initial_network(without_wild(observations), focal_px)
+    observations = without_wild(observations)
+    moving = moving_board(observations)
+    first, used, placed, prior = _first_adjustment(observations, moving, monitor, focal_px)
+    if placed.moving is not None and first.network.delay_images is not None:  # again, so that no view is apart because it was late
+        better = replace(placed.moving, expected_images=first.network.delay_images)
+        first, used, placed, prior = _first_adjustment(observations, better, monitor, focal_px)
+    sigma = robust_sigma(first.residual_px, used & np.isfinite(first.residual_px).all(axis=-1))
+    network, again = split_apart(first.network, placed.now(first.network), sigma)
+    if len(again.frames) > len(placed.labelled.frames):
+        placed = _Placed(labelled=again, moving=placed.moving)
+        network, used = placed.again(network, max(10 * sigma, 1.0))
+        first = adjust(network, placed.points or again.xy_px, used, prior, cauchy_px=3 * sigma, unit_px=sigma)
+    labelled = placed.labelled
+    monitor.step("calibration", 3, 5)
+    first, used = shaped(first, placed, used, prior)
+    monitor.step("calibration", 4, 5)
+    tested = without_outliers(first, labelled, used, prior, placed.again, placed.points)
+    done = without_insignificant(*tested, labelled, monitor, placed.points)
+    labelled = labelled.changed(done.observations.xy_px)
+    lines, doubts = _remarks_on_shape(labelled.board.corners_m, tested[0].network.corners_m, labelled.length_m)
+    for more in (_remarks_on_views(labelled), _remarks_on_moved_cameras(done)):
+        lines, doubts = lines + more[0], doubts + more[1]
+    return replace(done, remarks=tuple(lines), doubt=", and ".join(doubts))
+
+
+def _first_adjustment(
+    observations: BoardObservations, moving: MovingPoints | None, monitor: Monitor, focal_px: float | None
+) -> "tuple[Adjusted[BoardNetwork], np.ndarray, _Placed, Unknowns]":
+    """A robust adjustment from nothing: the network, the image points used, the positions, and the prior with delays if they matter."""
+    if moving is not None and moving.expected_images.any():
+        observations = observations.changed(moving.at(moving.expected_images)[0])
+    started = initial_network(observations, focal_px)
     monitor.step("calibration", 1, 5)
     network, sigma = _refined(started.network, started.observations, monitor)
     network, labelled = split_apart(network, started.observations, sigma)
@@ -55,20 +90,56 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
     prior = lens_prior(labelled.size_px, network.interior[:, 0])
     network, used = with_boards(network, labelled, max(10 * sigma, 1.0))
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
-    sigma = robust_sigma(first.residual_px, used)
-    network, again = split_apart(first.network, labelled, sigma)
-    if len(again.frames) > len(labelled.frames):
-        network, used = with_boards(network, again, max(10 * sigma, 1.0))
-        labelled, first = again, adjust(network, again.xy_px, used, prior, cauchy_px=3 * sigma, unit_px=sigma)
-    monitor.step("calibration", 3, 5)
-    first, used = shaped(first, labelled, used, prior)
-    monitor.step("calibration", 4, 5)
-    tested = without_outliers(first, labelled, used, prior, lambda boards, tolerance_px: with_boards(boards, labelled, tolerance_px))
-    done = without_insignificant(*tested, labelled, monitor)
-    lines, doubts = _remarks_on_shape(labelled.board.corners_m, tested[0].network.corners_m, labelled.length_m)
-    for more in (_remarks_on_views(labelled), _remarks_on_moved_cameras(done)):
-        lines, doubts = lines + more[0], doubts + more[1]
-    return replace(done, remarks=tuple(lines), doubt=", and ".join(doubts))
+    placed = _Placed(labelled=labelled, moving=moving)
+    delayed = None if placed.points is None else with_delays(first, placed.points, prior, sigma, placed.again)
+    if delayed is None:
+        return first, used, _Placed(labelled=labelled, moving=None), prior
+    return *delayed, placed, replace(prior, expected_delay_images=placed.expected_images)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Placed:
+    """Observations of which one frame may have several positions, and the paths of their corners if the cameras are not in step."""
+
+    labelled: BoardObservations
+    moving: MovingPoints | None
+
+    @property
+    def points(self) -> PlacedPoints | None:
+        """The corners as functions of the delays of the cameras."""
+        shown = self.labelled.views(self.labelled.visible)
+        return None if self.moving is None else placed_points(self.moving, self.labelled.frames, shown)
+
+    @property
+    def expected_images(self) -> np.ndarray | None:
+        """The delays of the cameras before the adjustment."""
+        return None if self.moving is None else self.moving.expected_images
+
+    def now(self, network: BoardNetwork) -> BoardObservations:
+        """The observations at the delays of a network."""
+        points, late = self.points, network.delay_images
+        return self.labelled if points is None or late is None else self.labelled.changed(points.at(late)[0])
+
+    def again(self, network: BoardNetwork, tolerance_px: float) -> tuple[BoardNetwork, np.ndarray]:
+        """The positions measured again with the cameras of a network, and the image points within a tolerance."""
+        return with_boards(network, self.now(network), tolerance_px)
+
+
+def moving_board(observations: BoardObservations) -> MovingPoints | None:
+    """The paths of the corners, and how late each camera is, roughly; None for images that do not follow one another.
+
+    The corners of a board that looks the same from both ends have no paths: their order may differ from image to image.
+    """
+    if len(observations.board.symmetries) > 1:
+        return None
+    moving = moving_points(observations.frames, observations.xy_px)
+    if not np.isfinite(moving.coefficients[1]).any():
+        return None
+    often = observations.visible.sum(axis=(0, 1))
+    usual = np.flatnonzero(often >= np.median(often))
+    some = usual[np.unique(np.linspace(0, len(usual) - 1, DELAY_CORNERS).astype(int))]
+    few = replace(moving, coefficients=moving.coefficients[:, :, :, some])
+    return replace(moving, expected_images=first_delays(few, observations.size_px, labelled=True))
 
 
 def _remarks_on_moved_cameras(done: Calibration) -> tuple[list[str], list[str]]:
@@ -178,20 +249,22 @@ def _stretch(plan_m: np.ndarray, corners_m: np.ndarray) -> float:
 
 
 def shaped(
-    first: Adjusted[BoardNetwork], observations: BoardObservations, used: np.ndarray, unknowns: Unknowns
+    first: Adjusted[BoardNetwork], placed: _Placed, used: np.ndarray, unknowns: Unknowns
 ) -> tuple[Adjusted[BoardNetwork], np.ndarray]:
     """The adjustment with the shape of the board, if it is significant, and the image points used.  (1)"""
     from scipy.special import fdtrc
 
+    observations, points = placed.labelled, placed.points
     if observations.measured(used).sum() < SHAPE_POSITIONS:
         return first, used
-    sigma = robust_sigma(first.residual_px, used)
-    network, used = with_boards(first.network, observations, GROSS * sigma)
+    sigma = robust_sigma(first.residual_px, used & np.isfinite(first.residual_px).all(axis=-1))
+    network, used = placed.again(first.network, GROSS * sigma)
     iteration = LevenbergMarquardt(max_iterations=6, tolerance=0.05)
-    flat = state = adjust(network, observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
+    flat = state = adjust(network, points or observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
     for _ in range(SHAPE_ROUNDS):
-        network = replace(state.network, corners_m=_corners(state.network, state.residual_px, used, observations.board.corners_m))
-        state = adjust(network, observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
+        kept = used & np.isfinite(state.residual_px).all(axis=-1)
+        network = replace(state.network, corners_m=_corners(state.network, state.residual_px, kept, observations.board.corners_m))
+        state = adjust(network, points or observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
     free = 3 * len(network.corners_m) - 7
     redundancy = 2 * used.sum() - 6 * network.count - (len(INTERIOR) + 6) * len(network.R) - free
     F = (flat.cost - state.cost) / free / (state.cost / max(redundancy, 1))

@@ -15,6 +15,7 @@ from .detection import MIRRORED, VARIANTS, Variant, find_corners, find_variant
 from .observations import BoardObservations
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with the board
+RUN = 8  # images that follow one another
 MOST_IMAGES = 600  # of a view that are searched, evenly spread
 MOST_STILLS = 60  # of a view: so few images are searched thoroughly
 TRIED_IMAGES = 24  # in which the variant is looked for
@@ -91,7 +92,7 @@ def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: 
 def _wanted(footage: BoardFootage) -> np.ndarray:
     """The numbers of the images that are searched."""
     every = np.unique(np.concatenate(footage.numbers))
-    return every[np.unique(np.linspace(0, len(every) - 1, MOST_IMAGES).astype(int))]
+    return every[_even(every, MOST_IMAGES)]
 
 
 def _variant(footage: BoardFootage, wanted: np.ndarray, board: Board, monitor: Monitor) -> Variant:
@@ -135,17 +136,23 @@ def _chosen(found: list[dict[int, np.ndarray]]) -> list[int]:
     """The frames that are adjusted: at most MOST_POSITIONS of those that most cameras show, evenly spread, and single views to fill up."""
     frames = sorted({frame for corners in found for frame in corners})
     cameras = np.array([sum(frame in corners for corners in found) for frame in frames])
+    number = np.array(frames)
     several = np.flatnonzero(cameras >= 2)
     single = np.flatnonzero(cameras < 2)
-    chosen = _even(several, MOST_POSITIONS)
-    chosen = np.concatenate([chosen, _even(single, MOST_POSITIONS - len(chosen))])
+    chosen = several[_even(number[several], MOST_POSITIONS)]
+    chosen = np.concatenate([chosen, single[_even(number[single], MOST_POSITIONS - len(chosen))]])
     return [frames[i] for i in np.sort(chosen)]
 
 
-def _even(index: np.ndarray, count: int) -> np.ndarray:
-    if len(index) <= count:
-        return index
-    return index[np.unique(np.linspace(0, len(index) - 1, count).astype(int))] if count > 0 else index[:0]
+def _even(numbers: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most `count` image numbers (n,), evenly spread, those that follow one another in runs: only these show motion."""
+    if len(numbers) <= count:
+        return np.arange(len(numbers))
+    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+    runs = [run[i : i + RUN] for run in np.split(np.arange(len(numbers)), breaks) for i in range(0, len(run), RUN)]
+    share = int(count * len(runs) / len(numbers))
+    some = np.unique(np.linspace(0, len(runs) - 1, max(share, 0)).astype(int))
+    return np.concatenate([np.arange(0), *(runs[i] for i in some)])[: max(count, 0)]
 
 
 def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> None:

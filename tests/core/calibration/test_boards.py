@@ -11,6 +11,7 @@ import pytest
 
 from tricap.core.calibration.boards.board import Board, BoardKind
 from tricap.core.calibration.boards.detection import Variant, find_corners, find_variant
+from tricap.core.calibration.boards.footage import _even
 from tricap.core.calibration.boards.observations import BoardObservations
 from tricap.core.calibration.bundle import Unknowns, design, moved, normal_equations, residuals
 from tricap.core.calibration.calibrate import calibrate_rig, open_boards
@@ -22,7 +23,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.synthetic.bar import RIG_KINDS, benchmark_cameras, random_cameras
-from tricap.core.synthetic.board import HeldBoard, held_board, picture_of_board
+from tricap.core.synthetic.board import HeldBoard, held_board, picture_of_board, waved_board
 
 from .truth import TEST_BARS, error_m
 
@@ -110,6 +111,25 @@ def test_views_out_of_step_are_found_and_reported() -> None:
     assert error_m(held.cameras, done.rig.cameras) < 2.5 * bound_m(held, 0.1)
 
 
+def test_cameras_that_are_not_in_step_are_calibrated_with_a_waved_board() -> None:
+    """Measured over 6 recordings: delays within 0.0003 images, errors 1.0 to 1.6 times the bound of cameras in step."""
+    rng, delay = np.random.default_rng(2), (0.0, 0.37, -2.2)
+    held = waved_board(benchmark_cameras(), CHESSBOARD.corners_m, 60, rng, delay_images=delay)
+    done = calibrate_rig(observed(held), Monitor())
+    for (value, sigma), true in zip(done.calibration.delays.values(), delay[1:], strict=True):
+        assert abs(value - true) < 0.003 and sigma < 0.001  # 0.1 ms at 30 images per second; the limit is 0.3
+    assert error_m(held.cameras, done.rig.cameras) < 2.0 * bound_m(held, 0.1)
+    assert done.verdict.light == "green" and not done.calibration.remarks
+
+
+def test_images_are_chosen_in_runs_that_show_motion() -> None:
+    assert np.array_equal(_even(np.arange(5), 9), np.arange(5))
+    chosen = _even(np.arange(4000), 240)
+    assert len(chosen) == 240 and (np.diff(chosen) == 1).sum() == 30 * 7 and chosen[-1] > 3900
+    apart = _even(np.arange(0, 4000, 2), 240)
+    assert len(apart) == 240 and np.diff(apart).min() > 4 and len(_even(np.arange(9), 0)) == 0
+
+
 @pytest.mark.parametrize(
     ("turned", "said"), [(0.01, "camera C, moved, exchanged or not synchronised"), (0.0005, "seems to have been moved")]
 )
@@ -161,7 +181,7 @@ def test_the_ends_of_a_symmetric_board_are_told_apart_by_the_other_cameras() -> 
     ("spoil", "message"),
     [
         (lambda xy: xy[:3], "Camera . shares only|Camera .*3 positions"),
-        (lambda xy: np.where(LAST, np.roll(xy, 1, axis=0), xy), "Camera R does not agree .* same instant"),
+        (lambda xy: np.where(LAST, np.roll(xy, 12, axis=0), xy), "Camera R does not agree .* same instant"),
         (lambda xy: np.where(LAST, mirrored(xy), xy), "Camera R does not agree .* mirrored"),
     ],
     ids=["three poses", "one camera late", "one camera mirrored"],
