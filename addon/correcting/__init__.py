@@ -4,9 +4,9 @@ import bpy
 
 
 def _classes() -> tuple[type, ...]:
-    from . import operators, panel, properties, pull_joint, review
+    from . import fit_again, operators, panel, properties, pull_joint, review
 
-    return (*properties.CLASSES, *operators.CLASSES, *pull_joint.CLASSES, *review.CLASSES, *panel.CLASSES)
+    return (*properties.CLASSES, *operators.CLASSES, *pull_joint.CLASSES, *fit_again.CLASSES, *review.CLASSES, *panel.CLASSES)
 
 
 def register() -> None:

@@ -49,7 +49,7 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
         layout.operator_context = "INVOKE_DEFAULT"
         column = layout.column(align=True)
         column.operator("tricap.pull_joint", icon="EMPTY_ARROWS")
-        column.operator("tricap.fit", text="Fit Again", icon="FILE_REFRESH")
+        column.operator("tricap.fit_again", icon="FILE_REFRESH")
         column = layout.column(align=True)
         column.operator("tricap.remove_trajectory", icon="TRACKER")
         column.operator("tricap.remove_region", icon="MESH_PLANE")

@@ -28,7 +28,7 @@ from . import action, armature, cameras, clips, metaballs, nodes, skin, standing
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
-from .rest_pose import with_rest_pose
+from .rest_pose import REST_POSE_KEY, with_rest_pose
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
@@ -375,6 +375,7 @@ def _add_body(
     rest_skin = contents.prepared.skin
     stand = standing.standing(shape, rest_skin.vertices_m if rest_skin else None, values, frames, contents.fps, known_floor)
     armature_object = armature.add_armature(collection, shape, stand)
+    armature_object.data[REST_POSE_KEY] = options.rest_pose
     flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:

@@ -18,6 +18,7 @@ from ...core.body.skeleton import Dof, bone_frames, frames_and_axes
 from ...core.body.skin.rays import swing
 
 POSES = ("A", "T")
+REST_POSE_KEY = "tricap_rest_pose"  # custom property of armature data
 T_POSE_ARM = {".R": np.array([-1.0, 0.0, 0.0]), ".L": np.array([1.0, 0.0, 0.0])}
 ARM = "upper_arm"
 

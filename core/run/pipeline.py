@@ -46,6 +46,7 @@ from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
+from .around_clicks import FITTED_WITH, fitted_with
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
@@ -123,8 +124,9 @@ def fit(run: Run, monitor: Monitor) -> None:
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
-    start = {"start": start_figures(given.start)} if given.start is not None else {}
-    run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **start)
+    noted = {"start": start_figures(given.start)} if given.start is not None else {}
+    noted[FITTED_WITH] = fitted_with(run.footage, run.settings, run.results.folder)
+    run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **noted)
 
 
 def report(run: Run, monitor: Monitor) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching import foreground as fg
@@ -148,11 +149,27 @@ def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
     results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
 
 
+def last_cloud(footage: Footage, results: Results, frame: int) -> PointCloud:
+    """The cloud of a frame as it was measured last, from whatever input.
+
+    Raises:
+        InputError: its checkpoint is missing or damaged.
+    """
+    path = results.path("cache", "surface", f"{frame:04d}.npz")
+    try:
+        arrays, header = store.load(path)
+        return _measured(footage, frame, str(header["key"]), arrays).cloud
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"The checkpoint {path} is damaged: run the whole fit again.") from error
+
+
 def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) -> MeasuredFrame | None:
     """A frame that was measured before, from the same input; None where there is none, or it is damaged."""
-    a = results.load_checkpoint("surface", f"{frame:04d}", key)
-    if a is None:
-        return None
+    arrays = results.load_checkpoint("surface", f"{frame:04d}", key)
+    return None if arrays is None else _measured(footage, frame, key, arrays)
+
+
+def _measured(footage: Footage, frame: int, key: str, a: dict[str, np.ndarray]) -> MeasuredFrame:
     spacing, gh, gw, tried = (int(v) for v in a["grid"])
     rows = footage.take.rows_at(frame)
     values = {

@@ -273,6 +273,25 @@ def write_trajectories(out: Path, filtered: Filtered, fps: float) -> None:
         store.save(out / f"trajectories{name}.npz", single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
 
 
+def read_trajectories(out: Path) -> Trajectories | None:
+    """The positions in OUT/trajectories.npz, with their velocities and accelerations; None without the file.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = out / "trajectories.npz"
+    if not path.is_file():
+        return None
+    arrays, _ = store.load(path)
+    vectors = ("xyz_m", "velocity_m_s", "acceleration_m_s2")
+    layout = dict(
+        frames=("iu", "T"), time_s=("f", "T"), sigma_m=("f", "TN"), status=("iu", "TN"), **{name: ("f", "TN3") for name in vectors}
+    )
+    store.check_layout(path, arrays, **layout)
+    values: dict[str, Any] = {name: arrays[name] for name in layout}
+    return Trajectories(**values, track=arrays.get("track"))
+
+
 def write_tracked_clouds(out: Path, kept: Trajectories, monitor: Monitor) -> None:
     """Write OUT/tracked/NNNN.ply, the points of the kept trajectories in each frame: the surface, cleaned by tracking (D'Apuzzo et al.
     1999, §2.4.2)."""

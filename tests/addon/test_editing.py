@@ -14,7 +14,7 @@ from .test_scene_standing import FLOOR_M, walk
 FRAMES, NOISY = 40, range(10, 20)
 
 
-def walker(bpy: ModuleType, *, sliding_m: float = 0.0) -> Any:
+def walker(bpy: ModuleType, *, sliding_m: float = 0.0, bent: float = 0.5) -> Any:
     """A person who stands still but for an arm that is uncertain and noisy for ten frames; the body slides by `sliding_m` a frame."""
     from tricap.addon.scene import action, armature
     from tricap.addon.scene.standing import Standing
@@ -26,7 +26,7 @@ def walker(bpy: ModuleType, *, sliding_m: float = 0.0) -> Any:
     values[:, 0] += sliding_m * np.sin(np.arange(FRAMES))
     names = list(shape.skeleton.dof_names)
     for side in "RL":  # knees a little bent, so that a leg can reach
-        for name, angle in {f"hip.{side} flexion": 0.25, f"knee.{side} flexion": 0.5, f"ankle.{side} flexion": 0.25}.items():
+        for name, angle in {f"hip.{side} flexion": bent / 2, f"knee.{side} flexion": bent, f"ankle.{side} flexion": bent / 2}.items():
             if name in names:
                 values[:, names.index(name)] = angle
     sigma = np.full(values.shape, np.radians(0.5))
@@ -97,6 +97,28 @@ def test_locked_feet_stand_still_and_can_be_let_go(blender: ModuleType) -> None:
     assert not [o for o in blender.data.objects if o.type == "EMPTY"]
     with pytest.raises(RuntimeError, match="are not locked"):
         blender.ops.tricap.remove_foot_lock()
+
+
+def test_the_pelvis_is_lowered_where_a_straight_leg_would_not_reach(blender: ModuleType) -> None:
+    from tricap.addon.editing.foot_lock import smoothly_above
+
+    body = walker(blender, sliding_m=0.03, bent=0.0)
+    pelvis = body.pose.bones["pelvis"]
+    before, heights = ankles(blender, body), []
+    for frame in range(FRAMES):
+        blender.context.scene.frame_set(frame)
+        heights.append((body.matrix_world @ pelvis.head).z)
+    assert blender.ops.tricap.lock_feet() == {"FINISHED"}
+    assert np.ptp(ankles(blender, body), axis=0).max() < 5e-4
+    lowered = []
+    for frame in range(FRAMES):
+        blender.context.scene.frame_set(frame)
+        lowered.append(heights[frame] - (body.matrix_world @ pelvis.head).z)
+    assert 2e-3 < max(lowered) < 0.01 and np.abs(np.diff(lowered)).max() < 1e-3
+    assert blender.ops.tricap.remove_foot_lock() == {"FINISHED"}
+    np.testing.assert_allclose(ankles(blender, body), before, atol=1e-5)
+    peaks = np.array([0, 0, 0, 3.0, 0, 0, 1, 0, 0, 0])
+    assert (smoothly_above(peaks, 2) >= peaks).all() and np.abs(np.diff(smoothly_above(peaks, 2))).max() < 1
 
 
 def test_the_influence_is_blended_and_the_place_changes_where_it_is_zero() -> None:

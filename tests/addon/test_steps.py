@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 
 from tricap.__main__ import main
+from tricap.core.body.shape import read_body
 from tricap.core.geometry.rig import read_rig, renamed, write_rig
+from tricap.core.motion.tables import read_joints, read_motion
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.writing import read_table, write_table
@@ -161,6 +163,42 @@ def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, 
     assert words().split()[3:7] == ["done", "done", "done", "stale"]
     assert blender.ops.tricap.run() == {"FINISHED"}
     assert words().split()[3:7] == ["done", "done", "done", "done"]
+
+
+def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
+    """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
+    scene, out = done, tmp_path / "out"
+    with pytest.raises(RuntimeError, match="drag a joint first"):
+        blender.ops.tricap.fit_again()
+    body, kept = scene.objects["Body"], {name: (out / name).read_bytes() for name in ("body.toml", "skin/rest.npz", "trajectories.npz")}
+    standing = importlib.import_module(f"{NAME}.scene.standing")
+    flexion = body.data["tricap_dofs"]["elbow.R flexion"].to_dict()
+
+    def channel() -> Any:
+        return next(
+            c
+            for c in standing.curves_of(body.animation_data.action)
+            if flexion["bone"] in c.data_path and c.array_index == flexion["index"]
+        )
+
+    channel().keyframe_points[2].co[1] += 0.5  # an edit of the animator's
+    before, was = read_joints(out / "joints.csv"), [channel().evaluate(frame) for frame in range(3)]
+    pull = importlib.import_module(f"{NAME}.correcting.pull_joint")
+    at = pull.cameras_of(scene)["C"].project(before.joints_m["wrist.R"][1]) + (0.0, 8.0)
+    assert blender.ops.tricap.pull_joint(name="wrist.R", view="C", frame=1, x=at[0], y=at[1]) == {"FINISHED"}
+    assert blender.ops.tricap.fit_again() == {"FINISHED"}
+    after = read_joints(out / "joints.csv")
+    shift = pull.cameras_of(scene)["C"].project(after.joints_m["wrist.R"][1]) - (at - (0.0, 8.0))
+    assert shift[1] > 0.02, "towards where it was dragged, against the images"
+    assert all((out / name).read_bytes() == content for name, content in kept.items())
+    motion = read_motion(out / "motion.csv", read_body(out / "body.toml").skeleton)
+    values = motion.values[:, motion.dof_names.index("elbow.R flexion")]
+    now = [channel().evaluate(frame) for frame in range(3)]
+    assert now[:2] == pytest.approx(values[:2].tolist(), abs=1e-5) and now[2] == pytest.approx(values[2] + 0.5, abs=1e-5) and now != was
+    entry = json.loads((out / "run.json").read_text())["stages"]["fit"]
+    assert entry["fitted_again"] == [[0, 2]] and words().split()[5] == "stale", "a whole fit would adjust the shape, too"
+    scene.tricap.fitting.gate_m = 0.04
+    assert blender.ops.tricap.fit_again() == {"FINISHED"} and words().split()[5] == "done", "more than clicks has changed: all is fitted"
 
 
 @pytest.mark.parametrize("text", ['{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])

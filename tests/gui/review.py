@@ -62,7 +62,7 @@ def pulled() -> drive.Steps:
     drive.check(np.abs(clicked - goal).max() < 2 / display.pixel_of(area) + 1, f"at {clicked}, dragged to {goal}")
     yield from drive.shot("2_pulled")
     began = time.monotonic()
-    yield from drive.press(area, "tricap.fit")
+    yield from drive.press(area, "tricap.fit_again")
     yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, STAGE_S, "Fit Again ends")
     drive.say(f"Fit Again took {time.monotonic() - began:.1f} s, at {display.slowness():.1f} times the usual load")
     moved = wrist_px() - before

@@ -122,8 +122,11 @@ def _person_cells(view: DistanceMap) -> PersonCells:
     return PersonCells(camera=view.camera, xy_px=xy, directions=directions, area_px=float(every * view.step_px**2), distance=view)
 
 
-def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[BackgroundDistances]:
-    """Where the views show the person and where the background, in the frames of the clouds; of the views in which that is known.
+def find_background(
+    footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor, rows: Sequence[int] | None = None
+) -> list[BackgroundDistances]:
+    """Where the views show the person and where the background, in the frames of the clouds, or of those in `rows`; of the views in which
+    that is known.
 
     Raises:
         InputError: an image or a mask cannot be read, or the background in take.toml is not that of the view.
@@ -155,12 +158,14 @@ def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Mon
         steps = np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)
         return np.where(unknown, 1, steps).astype(np.uint8)  # next to the person: neither that nor background
 
-    for t, cloud in enumerate(clouds):
-        monitor.step("background", t, len(clouds))
+    wanted = range(len(clouds)) if rows is None else rows
+    for i, t in enumerate(wanted):
+        monitor.step("background", i, len(wanted))
+        cloud = clouds[t]
         images = footage.read(cloud.frame) if known else []
         for k, of_view in zip(found, in_threads(partial(distances, cloud, images), [*found])):
             found[k].append(of_view)
-    views = footage.take.views
+    views, frames = footage.take.views, frames[list(wanted)]
     return [BackgroundDistances(view=views[k].name, frame=frames, distance=d, step_px=sizes[k], unit_px=UNIT_PX) for k, d in found.items()]
 
 

@@ -1,6 +1,7 @@
 """Fits without a measured surface (views far apart, a person without texture, or no need of one): outlines and keypoints remain."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -60,9 +61,16 @@ def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 
 
 def background_regions(
-    footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings, monitor: Monitor
+    footage: Footage,
+    results: Results,
+    clouds: Sequence[PointCloud],
+    settings: FitSettings,
+    monitor: Monitor,
+    rows: range | None = None,
 ) -> list[BackgroundDistances]:
     """The background regions of the views: outside the outline; in views without one, where the still background is visible.
+
+    `rows`: of the clouds, in whose frames they are wanted; by default in all.
 
     Raises:
         InputError: an image or a table of contours cannot be read.
@@ -70,8 +78,9 @@ def background_regions(
     """
     if not settings.use_background:
         return []
-    outlines = outline_polygons(footage, results) if settings.use_contours else {}
-    others = find_background(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
+    wanted = footage if rows is None else replace(footage, frames=footage.frames[rows.start : rows.stop])
+    outlines = outline_polygons(wanted, results) if settings.use_contours else {}
+    others = find_background(footage, clouds, monitor, rows) if len(outlines) < len(footage.take.views) else []
     return background_outside_outlines(footage, outlines) + [region for region in others if region.view not in outlines]
 
 

@@ -21,7 +21,7 @@ from ...body.skeleton import Skeleton
 from ..context import FitContext
 from ..explained import Evidence, limb_gains
 from ..inputs.cloud_points import CloudPoints
-from ..limb import Limb, whole_limbs
+from ..limb import Limb
 from ..solve.problem import Estimate
 from .limb_paths import ACCELERATION_M_S2, COARSE_M, FINE_M, GAIN, SIGMA_M
 
@@ -52,13 +52,15 @@ class Elsewhere:
     variance_m2: np.ndarray  # (T, E) of a coordinate of the ends of its bones
 
 
-def elsewhere(fit: FitContext, points: Sequence[CloudPoints], at: Estimate, time_s: np.ndarray, frames: range) -> list[Elsewhere]:
-    """For each whole limb of a body the other places where it could be, in some of the frames whose points and motion are given.
+def elsewhere(
+    fit: FitContext, points: Sequence[CloudPoints], at: Estimate, time_s: np.ndarray, frames: range, limbs: Sequence[Limb]
+) -> list[Elsewhere]:
+    """For each of some limbs the other places where it could be, in some of the frames whose points and motion are given.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    limbs, found = whole_limbs(fit.parameters), list[list[LimbModes]]()
+    found = list[list[LimbModes]]()
     for t in frames:
         fit.monitor.check()
         seen, state = fit.seen(t, points[t]), fit.parameters.state(at.motion[t], at.vector)

@@ -15,6 +15,7 @@ import numpy as np
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import MaterialTracks
+from ..limb import Limb, whole_limbs
 from ..observations.joints import StandingFeet
 from ..segmentation import crop
 from ..solve.block_band import NormalEquations
@@ -102,15 +103,18 @@ class FrameResults:
     elsewhere_m2: np.ndarray  # (n, J) variance that the other places of limbs add (`limb_modes`); joint_sigma_m is without it
 
 
-def frame_results(part: Recording, solution: Estimate, covariance: Covariance, frames: range) -> FrameResults:
-    """The results of some of the frames that were adjusted."""
+def frame_results(
+    part: Recording, solution: Estimate, covariance: Covariance, frames: range, limbs: Sequence[Limb] | None = None
+) -> FrameResults:
+    """The results of some of the frames that were adjusted. `limbs`: those that are looked for elsewhere, too; by default all."""
     fit, points, (pose, mixed, shape) = part.fit, part.points, covariance
     skeleton = fit.model.skeleton
     n, J, B = len(frames), len(skeleton.joint_names), len(skeleton.bones)
     joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
     sigma0 = np.array([frame_sigma0(fit, t, points[t], solution) for t in frames])
     counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
-    wrong, others = [], elsewhere(fit, points, solution, part.time_s, frames)
+    limbs = whole_limbs(fit.parameters) if limbs is None else limbs
+    wrong, others = [], elsewhere(fit, points, solution, part.time_s, frames, limbs)
     for i, t in enumerate(frames):
         fit.monitor.check()
         state = fit.parameters.state(solution.motion[t], solution.vector)

@@ -111,10 +111,10 @@ def fit_sequence(
         frames=given.frames,
         points=points,
         time_s=given.time_s,
-        sigma=typical_acceleration(motion, observed, given.time_s, _loosest(fit), _least(fit)),
+        sigma=typical_acceleration(motion, observed, given.time_s, largest_accelerations(fit), least_accelerations(fit)),
         tracks=tracks,
         lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
-        feet=_standing(fit, motion, first.vector, given.time_s),
+        feet=standing(fit, motion, first.vector, given.time_s),
     )
     start = Estimate(motion=motion, vector=first.vector)
     return _at_once(whole, start, monitor) if len(points) <= AT_ONCE else _in_stretches(whole, start, monitor, checkpoints)
@@ -146,12 +146,12 @@ def _at_once(whole: Recording, start: Estimate, monitor: Monitor) -> BodyFit:
 
 def _adjusted(part: Recording, start: Estimate, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
     """Poses and shape together. With the complete model there is a second solution, and the returned recording has that model."""
-    problem = _whole_sequence(part)
+    problem = whole_sequence(part)
     solution = _solve(part.fit, problem, start, monitor, ADJUST)
     solutions = [_restarted(part, solution, problem, monitor)]
     if part.fit.settings.balls == "complete":
         part = replace(part, fit=_completed(part.fit, solutions[0].vector))
-        problem = _whole_sequence(part)
+        problem = whole_sequence(part)
         again = replace(solutions[0], vector=part.fit.parameters.vector())
         solutions.append(_solve(part.fit, problem, again, monitor, "refine the complete model"))
     return part, problem, solutions
@@ -235,13 +235,13 @@ def _stretch(
     """One of `outwards`, from a motion (T, D) of all frames, with the priors from the stretches before it."""
     own, around, direction = place
     part = whole.stretch(around, motion, shape.vector)
-    problem = _whole_sequence(part, priors.adjustment)
+    problem = whole_sequence(part, priors.adjustment)
     pose_only = replace(problem, free_shape=NO_SHAPE)
     start = Estimate(motion=motion[around], vector=shape.vector)
     solution = solve(pose_only, start, steps=part.fit.settings.sequence_steps, monitor=monitor, slight_sigmas=SLIGHT_SIGMAS)
     solution = _restarted(part, solution, pose_only, monitor)
     local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, pose_only, solution)
-    covariance = _covariance(_whole_sequence(part, priors.covariance), solution, factors, shape.covariance)
+    covariance = _covariance(whole_sequence(part, priors.covariance), solution, factors, shape.covariance)
     next_ones = [d for d in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if d > 0 else own.start > 0)]
 
     def prior(earlier: MarginalPrior | None, ahead: bool, factors: Scales | None = None) -> MarginalPrior:
@@ -259,7 +259,7 @@ def _stretch(
     )
 
 
-def _standing(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
+def standing(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
     """Which feet stand in a motion (T, D), if that is asked for."""
     if not fit.settings.floor:
         return None
@@ -273,7 +273,7 @@ def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
 
 
-def _loosest(fit: FitContext) -> np.ndarray:
+def largest_accelerations(fit: FitContext) -> np.ndarray:
     """The largest sigma (D,) of accelerations."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
@@ -281,14 +281,14 @@ def _loosest(fit: FitContext) -> np.ndarray:
     return sigma
 
 
-def _least(fit: FitContext) -> np.ndarray:
+def least_accelerations(fit: FitContext) -> np.ndarray:
     """The least sigma (D,) of accelerations over the largest, however steady the observed motion."""
     share = np.full(len(fit.model.skeleton.dofs), LEAST_ANGULAR)
     share[fit.model.skeleton.layout.group("base")] = LEAST
     return share
 
 
-def _whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:
+def whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:
     """The adjustment of poses and shape, with the marginal prior from the frames of earlier stretches."""
     fit, points, feet = part.fit, part.points, part.feet
     priors, cache = shared_over_time(fit.priors, part.time_s), SegmentationCache()
@@ -364,7 +364,7 @@ def _result(
         joint_sigma_m=sigmas.total_m,
         joint_frame_sigma_m=sigmas.frame_m,
         known=known(skeleton, observed, contradicted_joints(fit.parameters, results.misplaced), sigmas.frame_m),
-        status=_statuses(fit, results.evidence, results.sigma0),
+        status=frame_statuses(fit, results.evidence, results.sigma0),
         sigma0=results.sigma0,
     )
     return BodyFit(
@@ -385,6 +385,11 @@ def _covariance(problem: Problem, solution: Solution, factors: Scales, shape: np
     return pose, mixed, shape
 
 
+def posterior(part: Recording, problem: Problem, solution: Solution, shape: np.ndarray) -> Covariance:
+    """The covariance of poses that were adjusted alone, where that of the shape (S, S) is known; `problem` has the shape free."""
+    return _covariance(problem, solution, _factors(part, replace(problem, free_shape=NO_SHAPE), solution), shape)
+
+
 def _factors(part: Recording, problem: Problem, solution: Solution) -> Scales:
     """The variance factors of the observations."""
     found = variance_factors(problem, linearise(problem, solution), solution.scales)
@@ -403,7 +408,7 @@ def _correlated(settings: FitSettings, own_m: float) -> float:
     return max(1.0, (own + reach * model) / (own + patch * model))
 
 
-def _statuses(fit: FitContext, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
+def frame_statuses(fit: FitContext, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
     enough = counts[:, free_bones(fit.parameters)] >= fit.settings.min_points
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))

@@ -47,7 +47,7 @@ def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
     model = with_limits(read_model(given.model), given.limits, given.locked)
     names, frames = model.skeleton.joint_names, given.frames
     tracks = JointTracks(given, names)
-    clicked, places = _clicked(given, names, settings)
+    clicked, places = clicks_by_frame(given, names, settings)
     wanted = given.click_frame if given.click_frame in given.clicks else None
     if given.start is not None:
         begin = frames.index(given.start.frame)
@@ -66,7 +66,7 @@ def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
         stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
     own = {"clicks": clicks, "click": begin, "priors": priors, "clicked": clicked, "places": places, "tracks": tracks}
     where = np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), located)], axis=0)
-    return _context(given, settings, model, scaled_shape(shape, stature), stature_sigma=stature_sigma, located=where, **own)
+    return context_of(given, settings, model, scaled_shape(shape, stature), stature_sigma=stature_sigma, located=where, **own)
 
 
 def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitInput:
@@ -103,7 +103,7 @@ def needs_start(given: FitInput, settings: FitSettings) -> bool:
     if given.keypoints:
         return False
     skeleton = with_limits(read_model(given.model), given.limits, given.locked).skeleton
-    _, places = _clicked(given, skeleton.joint_names, settings)
+    _, places = clicks_by_frame(given, skeleton.joint_names, settings)
     trunk = trunk_joints(skeleton)
     of_trunk = np.array([name in trunk for name in skeleton.joint_names])
     most = max((int(np.isfinite(xyz).all(axis=1).sum()) for xyz in places.values()), default=0)
@@ -130,9 +130,9 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
     middle = points_of(len(clouds) // 2).xyz_m
     found = with_limits(read_model(given.model), given.limits, given.locked)
     names = found.skeleton.joint_names
-    clicked, places = _clicked(given, names, settings)
+    clicked, places = clicks_by_frame(given, names, settings)
     nowhere = np.full((len(names), 3), np.nan)
-    fit = _context(
+    fit = context_of(
         given,
         settings,
         found,
@@ -149,7 +149,7 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
     return find_start(replace(fit, monitor=monitor), points_of, given.frames, given.time_s, monitor, without)
 
 
-def _context(given: FitInput, settings: FitSettings, model: BodyModel, shape: BodyShape, **own: object) -> FitContext:
+def context_of(given: FitInput, settings: FitSettings, model: BodyModel, shape: BodyShape, **own: object) -> FitContext:
     """A context of this input; `own`: what depends on the start."""
     parameters = ShapeParameters(shape, settings.weights)
     return FitContext(
@@ -169,7 +169,9 @@ def _model_shape(model: BodyModel, settings: FitSettings) -> BodyShape:
     return one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
 
 
-def _clicked(given: FitInput, names: tuple[str, ...], settings: FitSettings) -> tuple[dict[int, ClickedJoints], dict[int, np.ndarray]]:
+def clicks_by_frame(
+    given: FitInput, names: tuple[str, ...], settings: FitSettings
+) -> tuple[dict[int, ClickedJoints], dict[int, np.ndarray]]:
     """The clicks of each frame index, and the joints' places (J, 3), NaN without two views."""
     clicked, places = dict[int, ClickedJoints](), dict[int, np.ndarray]()
     for frame, joints in given.clicks.items():

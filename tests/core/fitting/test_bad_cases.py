@@ -14,7 +14,7 @@ from tricap.core.fitting.observations import PosePrior
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Estimate, Problem
 from tricap.core.fitting.solve.solver import _next_damping, solve
-from tricap.core.fitting.stages.sequence import _statuses, fit_context, fit_sequence
+from tricap.core.fitting.stages.sequence import fit_context, fit_sequence, frame_statuses
 from tricap.core.fitting.state import ShapeParameters, free_bones
 from tricap.core.foundation.errors import InputError
 
@@ -166,7 +166,7 @@ def test_a_partial_frame_can_be_suspect(make_scene) -> None:
     counts[3:] = counts[1]
     counts[4] = 0
     sigma0 = np.array([1.0, 1.1, 1.0, 5.0, np.nan])
-    assert _statuses(fit, counts, sigma0) == ("fitted", "partial", "fitted", "suspect", "bridged")
+    assert frame_statuses(fit, counts, sigma0) == ("fitted", "partial", "fitted", "suspect", "bridged")
 
 
 def test_a_step_that_gains_less_than_predicted_makes_the_next_one_shorter() -> None:

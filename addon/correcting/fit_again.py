@@ -1,0 +1,82 @@
+"""bpy.ops.tricap.fit_again(): the frames around the joints that were pulled or clicked since the fit are fitted again, in seconds."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+
+from ...core.foundation.progress import Monitor
+from .. import project
+from ..editing.curves import keys_of
+from ..operators.stages import Fit, StageOperator, run_and_read
+from ..overlay import canvas, results
+from ..scene.action import MEASURED_KEY, set_keys
+from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
+from ..scene.standing import LIFT_KEY, Standing, all_bodies, curves_of
+
+if TYPE_CHECKING:
+    from ...core.run.around_clicks import FittedAgain
+
+
+class FitAgain(StageOperator, bpy.types.Operator):
+    """Fit the frames around the joints that you pulled or clicked since the fit. If more than that has changed, fit all frames"""
+
+    bl_idname = "tricap.fit_again"
+    bl_label = "Fit Again"
+    bl_options = {"UNDO"}
+    step, stages = Fit.step, Fit.stages
+    take = out = ""  # those of the panel
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
+        """Folders and settings as they are now; writes the project's take.toml."""
+        take, out, overrides = project.chosen(context.scene, "", "")
+
+        def compute(monitor: Monitor) -> Any:
+            from ...core.run.around_clicks import fit_around_clicks
+
+            found = fit_around_clicks(take, out, overrides, monitor)
+            return found if found is not None else run_and_read(take, out, overrides, self.stages, False, monitor)
+
+        return compute
+
+    def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
+        """Move the keys of the body in the scene, and report."""
+        if isinstance(result, tuple):
+            return super().finish(context, result)
+        for body in all_bodies(context.scene):
+            move_keys(body, result)
+        results.clear()
+        canvas.redraw_clips(context)
+        context.scene.frame_set(context.scene.frame_current)
+        self.report({"INFO"}, str(result))
+        return {"FINISHED"}
+
+
+def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
+    """Add what the new fit changed to the actions of a body: the measured one, and the edited one with its edits."""
+    from ..scene.armature import channel_of
+
+    pose, none = str(body.data.get(REST_POSE_KEY, "A")), np.zeros_like(again.before)
+    before, after = (with_rest_pose(again.shape, values, none, pose)[1] for values in (again.before, again.after))
+    change = {name: column for name, column in zip(again.dof_names, (after - before).T) if np.abs(column).max() > 0}
+    stand = Standing(lift_m=body.data[LIFT_KEY], floor_m=body.location.z) if LIFT_KEY in body.data else None
+    channels = channel_of(again.shape, stand)
+    moved = {(f'pose.bones["{c.bone}"].{c.path}', c.index): c.sign * change[name] for name, c in channels.items() if name in change}
+    actions = {action for action in (body.animation_data and body.animation_data.action, body.get(MEASURED_KEY)) if action is not None}
+    for curve in (curve for action in actions for curve in curves_of(action)):
+        if (curve.data_path, curve.array_index) in moved:
+            _add(curve, again.frames, moved[curve.data_path, curve.array_index])
+
+
+def _add(curve: bpy.types.FCurve, frames: np.ndarray, change: np.ndarray) -> None:
+    """Add a change (n,) to a curve in some frames (n,), which get keys."""
+    at, values = keys_of(curve)
+    new = np.array([curve.evaluate(frame) for frame in frames]) + change
+    others = ~np.isin(at, frames)
+    at, values = np.concatenate([at[others], frames]), np.concatenate([values[others], new])
+    order = np.argsort(at)
+    set_keys(curve, at[order], values[order])
+
+
+CLASSES = (FitAgain,)

@@ -1,0 +1,69 @@
+"""Frames around a click are fitted again with the shape as it was: the lost limb is found, and nothing else moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.inputs.fit_input import FitInput
+from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages.fit_again import HELD, EarlierFit, around, fit_again, limbs_with, with_held
+from tricap.core.fitting.state import ShapeParameters
+from tricap.core.foundation.progress import Cancelled, Monitor
+
+CLICK, BENT = 12, np.radians(40)
+
+
+def test_the_frames_around_clicks() -> None:
+    frames, time_s = np.arange(100, 150), np.arange(50) / 25
+    assert around([120], frames, time_s) == [range(10, 31)]
+    assert around([101, 149], frames, time_s) == [range(0, 12), range(39, 50)]
+    assert around([120, 125], frames, time_s) == [range(10, 36)] and around([99], frames, time_s) == []
+    assert with_held(range(10, 31), 50) == range(10 - HELD, 31 + HELD) and with_held(range(0, 50), 50) == range(50)
+
+
+def test_the_limbs_of_clicked_joints() -> None:
+    parameters = ShapeParameters(default_shape(read_model("full")))
+    named = lambda *joints: [parameters.skeleton.bones[limb.bones[0]].name for limb in limbs_with(parameters, joints)]  # noqa: E731
+    assert named("wrist.R") == named("elbow.R", "wrist.R") == ["upper_arm.R"] and named("knee.L", "wrist.R") == ["thigh.L", "upper_arm.R"]
+    assert named("wrist.R", "pelvis") == [], "the trunk carries all limbs"
+
+
+def test_a_lost_limb_follows_its_click(make_scene) -> None:
+    scene = make_scene(frames=28, seed=3, click=CLICK)
+    shape = replace(scene.shape, length_sigma_m=0.01 * scene.shape.lengths_m, radius_sigma_m=0.05 * scene.shape.metaballs.radii_m)
+    lost = np.exp(-0.5 * ((np.arange(28) - CLICK) / 3) ** 2)[:, None] * np.where(np.arange(8) >= 6, BENT, 0.0)
+    earlier = EarlierFit(
+        shape=shape,
+        frames=np.arange(28),
+        time_s=scene.time_s,
+        values=scene.motion + lost,
+        common_m=np.full(len(shape.skeleton.joint_names), 0.002),
+    )
+    (rows,) = around([CLICK], earlier.frames, earlier.time_s)
+    inside = with_held(rows, 28)
+    given = FitInput(
+        rig=scene.rig,
+        model=scene.model,
+        clouds=[scene.clouds[t] for t in inside],
+        clicks={CLICK: scene.clicks},
+        time_s=scene.time_s[inside],
+        trajectories=scene.trajectories,
+    )
+    motion = fit_again(given, earlier, rows, ["wrist.R"], FitSettings(voxel_m=0.005), Monitor())
+    assert motion.frames.tolist() == list(rows)
+    true, before = (
+        np.stack(list(joint_positions(shape.skeleton, shape.lengths_m, values).values()), axis=1)
+        for values in (scene.motion, earlier.values)
+    )
+    error, was = (np.linalg.norm(xyz - true[rows], axis=2).max(axis=1) for xyz in (motion.joints_m, before[rows]))
+    assert was.max() > 0.15 and error.max() < 0.012  # 0.005
+    assert np.abs(motion.values[[0, -1]] - earlier.values[[rows[0], rows[-1]]]).max() < 0.1, "the motion stays continuous"
+    assert (motion.joint_sigma_m >= 0.002).all() and set(motion.status) <= {"fitted", "partial"}
+    stopped = Monitor()
+    stopped.cancel()
+    with pytest.raises(Cancelled):
+        fit_again(given, earlier, rows, ["wrist.R"], FitSettings(), stopped)
