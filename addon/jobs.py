@@ -4,8 +4,9 @@ A job is a function of a `Monitor` that is independent of Blender. `Job.run()` c
 computes it on a worker thread while a modal operator watches. Whatever ends the session (Esc, another file, quitting, disabling the
 add-on) cancels the job AND waits for its thread.
 
-`JobOperator` gives an operator three moves: `snapshot` (main thread: read what is needed from Blender) → the function it returns
-(any thread, no bpy) → `finish` (main thread: write the result into the scene).
+`JobOperator` gives an operator these moves: `snapshot` (main thread: read what is needed from Blender) → the function it returns
+(any thread, no bpy) → `in_steps` (main thread, step by step between redraws: what needs Blender and takes long) → `finish` (main thread:
+write the result into the scene).
 """
 
 import atexit
@@ -15,7 +16,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -30,6 +31,7 @@ from .session import get_session
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1  # between two looks at a job
+STEPS_S = 0.08  # of steps on the main thread, before the window has its turn
 SHOW_S = 0.25  # between two drawings of its progress: on a busy machine drawing takes the most time
 PACE_S, PACE_PARTS = 20.0, 200  # the time left is estimated from the pace of the last seconds, or parts
 ENOUGH = 0.05  # of a stage, or one of its parts, before the time left is estimated
@@ -46,9 +48,31 @@ class Job:
         self.monitor = Monitor(self._note)
         self.stage, self.done, self.total = "", 0.0, 0.0
         self._pace: deque[tuple[float, float]] = deque(maxlen=PACE_PARTS)  # time, and fraction of the current stage
+        self._steps_left: Generator[None, None, Any] | None = None
         self.result: Any = None
         self.error: BaseException | None = None
         self.trace = ""
+
+    def advance(self, steps: Callable[[], Generator[None, None, Any]], seconds: float) -> bool:
+        """Take some of the `steps` that follow the computation, on the main thread; whether they have ended. Never raises: see `error`."""
+        until = time.monotonic() + seconds
+        try:
+            if self._steps_left is None and self.error is None:
+                self._steps_left = steps()
+            while self._steps_left is not None:
+                next(self._steps_left)
+                if time.monotonic() > until:
+                    return False
+        except StopIteration as end:
+            self.result = end.value
+        except BaseException as error:  # the edge of the steps: the operator reports whatever happens
+            self.error, self.trace = error, traceback.format_exc()
+        return True
+
+    def leave(self) -> None:
+        """Give up the steps that are left."""
+        if self._steps_left is not None:
+            self._steps_left.close()
 
     def run(self) -> None:
         """Compute at once; never raises: see `error`."""
@@ -192,6 +216,11 @@ class JobOperator:
         """Main thread: read everything from Blender and return the computation."""
         raise NotImplementedError
 
+    def in_steps(self, context: bpy.types.Context, result: Any, monitor: Monitor) -> Generator[None, None, Any]:
+        """Main thread: what else is needed from Blender, with a `yield` after each step; returns the result."""
+        return result
+        yield
+
     def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
         """Main thread: write the result to the scene; returns the operator's result."""
         raise NotImplementedError
@@ -202,6 +231,7 @@ class JobOperator:
         if job is None:
             return {"CANCELLED"}
         job.run()
+        job.advance(lambda: self.in_steps(context, job.result, job.monitor), float("inf"))
         return self._conclude(context, job)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event | None) -> set[str]:
@@ -233,7 +263,7 @@ class JobOperator:
             self.job.monitor.cancel()
         elif event.type != "TIMER":
             return {"PASS_THROUGH"}
-        if self.job.alive:
+        if self.job.alive or not self.job.advance(lambda: self.in_steps(context, self.job.result, self.job.monitor), STEPS_S):
             self._show(context)
             return {"RUNNING_MODAL" if event.type == "ESC" else "PASS_THROUGH"}
         self.clear(context)
@@ -242,6 +272,7 @@ class JobOperator:
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator (another file, quitting)."""
         self.job.cancel_and_join()
+        self.job.leave()
         self.clear(context)
 
     def _prepare(self, context: bpy.types.Context) -> Job | None:

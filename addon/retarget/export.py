@@ -1,5 +1,6 @@
 """Exports motions for other programs: BVH and points by core's writers, the other formats by Blender's exporters."""
 
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,9 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     monitor.step("exporting", 0, 1)
     if is_imported_by_blender(out):
         from .files import open_moving
+        from .read import ended
 
-        return export_played(open_moving(out), kind, file, preset, monitor)
+        return ended(exporting_played(open_moving(out), kind, file, preset, monitor))
     if kind == "ply":
         return _copy_ply(out, file, of)
     if kind in POINTS:
@@ -74,8 +76,8 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     return export_motion(kind, out, file, program, motion)
 
 
-def export_played(armature_object: Any, kind: str, file: Path, preset: str, monitor: Monitor) -> str:
-    """Write what an armature of the open file plays, with the meshes that it deforms; returns a summary. Main thread only.
+def exporting_played(armature_object: Any, kind: str, file: Path, preset: str, monitor: Monitor) -> Generator[None, None, str]:
+    """Write what an armature of the open file plays, with the meshes that it deforms, in steps; returns a summary. Main thread only.
 
     Raises:
         InputError: the armature cannot be exported in this format, or the file cannot be written.
@@ -85,8 +87,8 @@ def export_played(armature_object: Any, kind: str, file: Path, preset: str, moni
 
     program = PROGRAMS[preset]
     if kind == "ply":
-        return playing.write_skins(armature_object, file, monitor)
-    motion = playing.read_played(armature_object, monitor)
+        return (yield from playing.writing_skins(armature_object, file, monitor))
+    motion = yield from playing.reading_played(armature_object, monitor)
     if kind in POINTS:
         return _write_points(kind, file, playing.points_of_played(armature_object, motion), program, motion)
     if kind in SKELETONS:

@@ -5,7 +5,7 @@ root, which carries the path). Control bones are not. Meshes are copied as they 
 is bound to this bone alone.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from ...core.motion.formats.markers import Markers
 from ...core.motion.formats.ply import write_mesh
 from ...core.motion.retarget.rig import Motion, Rig
 from ..scene.armature import JOINTS_KEY
-from .read import read_motion, read_rig
+from .read import read_rig, reading_motion
 
 RIGID = "Tricap rigid"  # the modifier of the copy of a mesh whose parent is a bone
 
@@ -32,8 +32,8 @@ def played_frames(scene: bpy.types.Scene) -> range:
     return range(scene.frame_start, scene.frame_end + 1)
 
 
-def read_played(armature_object: bpy.types.Object, monitor: Monitor | None = None) -> Motion:
-    """The motion of the exported bones in every frame that Blender plays. Main thread only.
+def reading_played(armature_object: bpy.types.Object, monitor: Monitor | None = None) -> Generator[None, None, Motion]:
+    """The motion of the exported bones in every frame that Blender plays, with a step for each. Main thread only.
 
     Raises:
         InputError: it is not an armature, has no bones, or is scaled unevenly.
@@ -47,7 +47,7 @@ def read_played(armature_object: bpy.types.Object, monitor: Monitor | None = Non
         raise InputError(f"The scene ends in frame {scene.frame_end}, before it begins; correct its frame range.")
     with in_first_frame():
         rig = exported_rig(armature_object)
-    return read_motion(armature_object, rig, frames, monitor)
+    return (yield from reading_motion(armature_object, rig, frames, monitor))
 
 
 @contextmanager
@@ -177,8 +177,8 @@ def _bind_whole(mesh: bpy.types.Object, armature_object: bpy.types.Object, bone:
     mesh.modifiers.new(RIGID, "ARMATURE").object = armature_object
 
 
-def write_skins(armature_object: bpy.types.Object, folder: Path, monitor: Monitor | None = None) -> str:
-    """Write the meshes as they are deformed in every frame that Blender plays, one PLY file for each frame; returns a summary.
+def writing_skins(armature_object: bpy.types.Object, folder: Path, monitor: Monitor | None = None) -> Generator[None, None, str]:
+    """Write the meshes as they are deformed in every frame that Blender plays, one PLY file and step for each frame; returns a summary.
 
     Raises:
         InputError: there are no meshes, or a file cannot be written.
@@ -194,6 +194,7 @@ def write_skins(armature_object: bpy.types.Object, folder: Path, monitor: Monito
             scene.frame_set(frame)
             vertices_m, faces = _evaluated(skins)
             write_mesh(folder / f"{frame:04d}.ply", vertices_m, faces)
+            yield
     finally:
         scene.frame_set(now)
     return f"{len(frames)} files with {len(vertices_m)} points each"

@@ -4,8 +4,9 @@ Motion is read by playing the scene once, with constraints, drivers and layers; 
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from ...core.motion.retarget.roles import role_of
 from ..scene.armature import ROLES_KEY
 from ..scene.standing import curves_of
 
+A = TypeVar("A")
 UNIFORM = 1e-3  # relative tolerance between the scales along the axes
 RESIDUAL_KEY = "tricap_unshown"  # custom property of an action: its residual motion, and a digest of the keys that it belongs to
 
@@ -181,8 +183,24 @@ def sole_points(points: np.ndarray) -> np.ndarray:
     return points[np.unique(np.argmax(down @ points.T, axis=1))]
 
 
+def ended(steps: Generator[None, None, A]) -> A:
+    """Take all steps at once; the result at their end."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(A, end.value)
+
+
 def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[int], monitor: Monitor | None = None) -> Motion:
     """The motion of an armature as it plays in its scene, constraints and all. The scene's current frame is restored."""
+    return ended(reading_motion(armature_object, rig, frames, monitor))
+
+
+def reading_motion(
+    armature_object: bpy.types.Object, rig: Rig, frames: Sequence[int], monitor: Monitor | None = None
+) -> Generator[None, None, Motion]:
+    """`read_motion` with a step for each frame, so that the window can be drawn meanwhile."""
     scene = bpy.context.scene
     now, names, monitor = scene.frame_current, rig.names, monitor or Monitor()
     pose = np.empty((len(frames), len(names), 4, 4))
@@ -194,6 +212,7 @@ def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[in
             bones = armature_object.pose.bones
             pose[i] = [bones[name].matrix for name in names]
             world[i] = armature_object.matrix_world
+            yield
     finally:
         scene.frame_set(now)
     placed = world[:, None] @ pose

@@ -1,7 +1,8 @@
 """bpy.ops.tricap.export(filepath="…", kind="bvh", preset="plain", source="PLAYED", armature="", out="")"""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -11,7 +12,7 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from .. import folders
 from ..jobs import JobOperator
-from ..retarget.export import BY_BLENDER, export_file, export_played, named_for
+from ..retarget.export import BY_BLENDER, export_file, exporting_played, named_for
 from ..retarget.operators import armature_of
 from ..retarget.programs import PROGRAMS
 from ..retarget.properties import EXPORTED
@@ -38,7 +39,7 @@ class Export(JobOperator, bpy.types.Operator):
     bl_idname = "tricap.export"
     bl_label = "Export"
     step = "retarget"
-    if_stopped = "No file was written."
+    if_stopped = "The file is as it was before; of PLY files, those written so far stay."
 
     kind: bpy.props.EnumProperty(name="Format", items=KINDS, default="bvh")  # type: ignore[valid-type]
     preset: bpy.props.EnumProperty(
@@ -56,12 +57,25 @@ class Export(JobOperator, bpy.types.Operator):
         description="Measured Motion: of the run in this folder; empty: the project's. A folder selects Measured Motion",
     )
 
+    chosen: bpy.props.BoolProperty(name="File Chosen", default=False, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the file; the export itself is quick."""
+        """Ask for the file; with a file, export with progress and Esc."""
+        if self.chosen:
+            return super().invoke(context, event)
+        self._asked = True
         name = "skin" if self.kind == "ply" else f"motion.{self.kind}"
         self.filepath = self.filepath or str(Path(bpy.data.filepath).parent / name if bpy.data.filepath else name)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Export at once; after the file browser, which ends with this call, as a job of its own, which Esc stops."""
+        if not getattr(self, "_asked", False):
+            return super().execute(context)
+        given = {name: getattr(self, name) for name in ("kind", "preset", "filepath", "source", "armature", "out")}
+        bpy.ops.tricap.export("INVOKE_DEFAULT", chosen=True, **given)
+        return {"FINISHED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         """The options in the file browser."""
@@ -104,11 +118,15 @@ class Export(JobOperator, bpy.types.Operator):
             raise InputError(f"The scene has {len(armatures)} armatures. Choose the one to export.")
         return armatures[0]
 
+    def in_steps(self, context: bpy.types.Context, result: Any, monitor: Monitor) -> Generator[None, None, Any]:
+        """Read what plays, frame by frame, and write it."""
+        if self._armature is None:
+            return result
+        return (yield from exporting_played(self._armature, self.kind, self._file, self.preset, monitor))
+
     def finish(self, context: bpy.types.Context, result: str | Motion) -> set[str]:
         """Write what needs the open file, and report it."""
-        if self._armature is not None:
-            result = export_played(self._armature, self.kind, self._file, self.preset, Monitor())
-        elif isinstance(result, Motion):
+        if isinstance(result, Motion):
             from ..retarget.by_blender import export_motion
 
             result = export_motion(self.kind, self._out, self._file, PROGRAMS[self.preset], result)

@@ -16,8 +16,9 @@ import pytest
 
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
-from tricap.addon.retarget.export import export_file, export_played, named_for, points_of
-from tricap.addon.retarget.playing import read_played
+from tricap.addon.retarget.export import export_file, exporting_played, named_for, points_of
+from tricap.addon.retarget.playing import reading_played
+from tricap.addon.retarget.read import ended
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import about, angle_of, transposed
@@ -274,8 +275,8 @@ def walker(empty: ModuleType) -> Any:
 def test_engines_get_a_root_bone_that_carries_the_path(
     empty: ModuleType, walker: Any, tmp_path: Path, preset: str, root: str, hips: str
 ) -> None:
-    wanted = read_played(walker)
-    export_played(walker, "fbx", tmp_path / "a.fbx", preset, Monitor())
+    wanted = ended(reading_played(walker))
+    ended(exporting_played(walker, "fbx", tmp_path / "a.fbx", preset, Monitor()))
     imported(empty, tmp_path / "a.fbx", wanted.fps)
     armature = next(o for o in empty.data.objects if o.type == "ARMATURE")
     assert [b.name for b in armature.data.bones if b.parent is None] == [root] and armature.data.bones[hips].parent.name == root
@@ -291,14 +292,14 @@ def test_engines_get_a_root_bone_that_carries_the_path(
 
 
 def test_opensim_and_segments_of_what_plays(empty: ModuleType, walker: Any, tmp_path: Path) -> None:
-    wanted = read_played(walker)
-    done = export_played(walker, "mot", tmp_path / "a.mot", "opensim", Monitor())
+    wanted = ended(reading_played(walker))
+    done = ended(exporting_played(walker, "mot", tmp_path / "a.mot", "opensim", Monitor()))
     assert "their model a.osim" in done
     _, R, origin_m = played_by_opensim(tmp_path / "a.osim", tmp_path / "a.mot")
     A = AXES["OpenSim"]
     assert np.abs(origin_m - wanted.head_m @ A.T).max() < PLACE_M
     assert np.degrees(angle_of(transposed(R) @ A @ wanted.R @ transposed(wanted.rig.R_rest) @ A.T)).max() < 0.1
-    assert "20 segments" in export_played(walker, "c3d", tmp_path / "a.c3d", "plain", Monitor())
+    assert "20 segments" in ended(exporting_played(walker, "c3d", tmp_path / "a.c3d", "plain", Monitor()))
     found = read_segments(tmp_path / "a.c3d")
     assert found is not None and np.abs(found.origin_m - wanted.head_m).max() < PLACE_M
     assert np.degrees(angle_of(transposed(found.R) @ wanted.R)).max() < 0.1

@@ -59,6 +59,41 @@ def test_here_and_on_a_thread_give_the_same(jobs: ModuleType) -> None:
     assert here.fraction == there.fraction == 0.5
 
 
+def test_steps_on_the_main_thread_are_taken_in_turns_with_the_window(jobs: ModuleType) -> None:
+    """What needs Blender after the computation: some steps at a time, stopped like it, with its mistakes reported."""
+    left: list[str] = []
+
+    def steps(job: Any, last: int) -> Any:
+        try:
+            for i in range(last):
+                job.monitor.step("reading", i, last)
+                yield
+        finally:
+            left.append("tidy")
+        return f"{last} steps after {job.result}"
+
+    def advanced(last: int, seconds: float) -> Any:
+        job = jobs.Job(lambda monitor: "it")
+        job.run()
+        return job, lambda: job.advance(lambda: steps(job, last), seconds)
+
+    job, advance = advanced(3, float("inf"))
+    assert advance() and job.result == "3 steps after it" and job.error is None
+    job, advance = advanced(3, -1.0)
+    assert [advance() for _ in range(4)] == [False, False, False, True] and job.result == "3 steps after it" and job.done == 2
+    job, advance = advanced(3, -1.0)
+    assert not advance()
+    job.monitor.cancel()
+    assert advance() and type(job.error).__name__ == "Cancelled"
+    job, advance = advanced(3, -1.0)
+    assert not advance()
+    job.leave()
+    assert left == ["tidy"] * 4, "however they end, what they changed is put back"
+    failed = jobs.Job(lambda monitor: 1 / 0)
+    failed.run()
+    assert failed.advance(lambda: steps(failed, 1), 1.0) and isinstance(failed.error, ZeroDivisionError)
+
+
 def test_the_window_gets_its_turn_while_python_computes(jobs: ModuleType) -> None:
     """A worker that never leaves the interpreter: the main thread has its turn between any two of its steps."""
     before, worked = sys.getswitchinterval(), threading.Event()
