@@ -91,7 +91,7 @@ def _lower_pelvis(body: bpy.types.Object, motion: Motion, rig_map: RigMap, spans
 
 
 def smoothly_above(values: np.ndarray, reach: int) -> np.ndarray:
-    """A smooth curve (T,) that is nowhere below some values (T,): the mean of their largest neighbours, over `reach` frames to both sides."""
+    """A smooth curve (T,) that is nowhere below some values (T,): the mean of their largest within `reach` frames to both sides."""
 
     def around(of: np.ndarray) -> np.ndarray:
         return np.lib.stride_tricks.sliding_window_view(np.pad(of, reach, mode="edge"), 2 * reach + 1)
