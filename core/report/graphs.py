@@ -103,7 +103,7 @@ class _Axes:
 
     def __init__(self, first: float, last: float, low: float, high: float) -> None:
         pad = 0.08 * (high - low) or max(abs(high), 1.0) * 0.1
-        self._frames, self._values = (float(first), float(last)), (low, high)
+        self._frames = float(first), float(last)
         self.range = low - pad, high + pad
 
     def x(self, frame: np.ndarray | float) -> np.ndarray:
@@ -128,14 +128,24 @@ class _Axes:
         ]
         parts += [
             f'<line x1="{LEFT}" x2="{RIGHT_X}" y1="{self.y(v):.1f}" y2="{self.y(v):.1f}" stroke="currentColor" opacity="0.2"/>'
-            f'<text x="{LEFT - 6}" y="{self.y(v) + 4:.1f}" text-anchor="end">{v:.4g}</text>'
-            for v in np.linspace(*self._values, 3)
+            f'<text x="{LEFT - 6}" y="{self.y(v) + 4:.1f}" text-anchor="end">{text}</text>'
+            for v, text in ticks(*self.range)
         ]
         return "".join(parts) + (
             f'<line class="cross" visibility="hidden" y1="{TOP}" y2="{BOTTOM_Y}" stroke="currentColor" opacity="0.6"/>'
             f'<text class="end" x="{LEFT}" y="{HEIGHT - 8}">frame {first:.0f}</text>'
             f'<text class="end" x="{RIGHT_X}" y="{HEIGHT - 8}" text-anchor="end">{last:.0f}</text>'
         )
+
+
+def ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Round values between two others, 1, 2 or 5 times a power of ten apart, with their labels: two to five of them."""
+    least = (high - low) / 5
+    power = 10.0 ** np.floor(np.log10(least))
+    step = next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= least * (1 - 1e-9))
+    decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+    values = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1) + 0.0
+    return [(v, f"{v:.{decimals}f}" if step < 1e5 else f"{v:.3g}") for v in values.tolist()]
 
 
 def field_graph(

@@ -166,13 +166,14 @@ def _strip(report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor
     k = footage.take.reference
     camera, frames = footage.rig.cameras[k], body.motion.frames.tolist()
     chosen = strip_frames(len(frames), [frames.index(frame) for frame in report.doubtful if frame in frames])
-    side = max(window_px(camera, body.motion.joints_m[i]) for i in chosen)
     found = []
     for i in chosen:
         monitor.step("report", 1, 2)
         centre, grey = camera.project(body.motion.joints_m[i]), footage.read(frames[i])[k]
         middle = 0.5 * (np.nanmin(centre, axis=0) + np.nanmax(centre, axis=0))
-        picture = body_by_sigma(grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, side)
+        picture = body_by_sigma(
+            grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, window_px(camera, body.motion.joints_m[i])
+        )
         why = f": {report.doubtful[frames[i]]}" if frames[i] in report.doubtful else ""
         found.append((f"Frame {frames[i]}{why}", pictures.jpeg(picture)))
     return found

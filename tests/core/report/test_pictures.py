@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.report import pictures
-from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned
+from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned, ticks
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 
@@ -88,3 +88,13 @@ def test_png_and_grey() -> None:
     picture = pictures.colour(np.array([[-5.0, 300.0]]))
     assert picture[0].tolist() == [[0, 0, 0], [255, 255, 255]]
     assert np.array_equal(cv2.imdecode(np.frombuffer(pictures.png(picture), np.uint8), cv2.IMREAD_COLOR), picture)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [(0.00753, 0.00898, ["0.0080", "0.0085"]), (1800.0, 2600.0, ["1800", "2000", "2200", "2400", "2600"]), (-3.2, 1.1, ["-3", "-2", "-1", "0", "1"]),
+     (0.82, 0.89, ["0.82", "0.84", "0.86", "0.88"]), (2.0, 2e7, ["5e+06", "1e+07", "1.5e+07", "2e+07"])],
+)  # fmt: skip
+def test_the_scale_has_round_values(low: float, high: float, labels: list[str]) -> None:
+    found = ticks(low, high)
+    assert [text for _, text in found] == labels and all(low <= value <= high for value, _ in found)
