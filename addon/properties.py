@@ -15,7 +15,7 @@ from ..core.foundation import settings as knobs
 from ..core.run.settings import SETTINGS, settings_of
 from . import take_properties
 from .editing import foot_lock, uncertainty
-from .scene import metaballs, standing
+from .scene import footage_plane, metaballs, standing
 from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -159,6 +159,13 @@ def register() -> None:
             get=lambda group: any(foot_lock.is_active(body) for body in standing.all_bodies(group.id_data)),
             set=lambda group, value: [foot_lock.activate(body, value) for body in standing.all_bodies(group.id_data)],
             description="Let the foot lock act; without it the feet move as measured",
+        ),
+        "render_footage": bpy.props.BoolProperty(
+            name="Footage in Renders",
+            options=set(),
+            get=lambda group: footage_plane.shown(group.id_data),
+            set=lambda group, value: footage_plane.show(group.id_data, value),
+            description="Render the body over the footage of the scene's camera; otherwise in a studio, on the floor",
         ),
         "path": bpy.props.EnumProperty(
             name="Path",

@@ -24,7 +24,7 @@ from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, metaballs, nodes, skin, standing, surroundings
+from . import action, armature, cameras, clips, footage_plane, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
@@ -276,6 +276,7 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
             )
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
+        footage_plane.add_screen(collection, camera_object, camera, clip, files)
         if camera is reference:
             scene.camera, scene.active_clip = camera_object, clip
     return len(take.views)

@@ -139,7 +139,12 @@ def heat_material(name: str, attribute: str, largest: float) -> bpy.types.Materi
     return material
 
 
-def _shader(material: bpy.types.Material) -> bpy.types.Node:
+def tree_of(material: bpy.types.Material) -> bpy.types.NodeTree:
+    """The nodes of a material."""
     if bpy.app.version < (5, 0, 0):  # later versions always use nodes, and warn about this
         material.use_nodes = True
-    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    return material.node_tree
+
+
+def _shader(material: bpy.types.Material) -> bpy.types.Node:
+    return next(node for node in tree_of(material).nodes if node.type == "BSDF_PRINCIPLED")

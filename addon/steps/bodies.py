@@ -16,7 +16,7 @@ from ..operators import control_rig
 from ..panels import sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
-from ..scene import metaballs, standing
+from ..scene import footage_plane, metaballs, standing
 from . import check, states, watch
 from .person import draw_person
 from .states import Fix, Status
@@ -206,6 +206,8 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
     edited = next(standing.all_bodies(context.scene), None)
     if edited is not None:
         editing.draw(layout, edited)
+    if next(footage_plane.screens(context.scene), None) is not None:
+        layout.prop(context.scene.tricap, "render_footage")
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

@@ -118,3 +118,40 @@ def test_footage_that_blender_cannot_show_is_told(empty: ModuleType, tmp_path: P
     size, gap = clips.clip_faults(clip, dataclasses.replace(camera, size_px=(100, 50)), files, "view C")
     assert "192×144" in size and "100×50" in size
     assert "only 3 of the 8" in gap
+
+
+def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, tmp_path: Path) -> None:
+    """The screen before the camera, rendered, against the image undistorted by the camera's own model."""
+    import cv2
+
+    from tricap.addon.scene import cameras, clips, footage_plane, surroundings
+    from tricap.addon.scene.preview import undistorted
+
+    camera, scene, files = small_rig()["R"], empty.context.scene, [tmp_path / f"{frame:04d}.png" for frame in (3, 4, 5)]
+    y, x = np.indices(SIZE[::-1])
+    for i, file in enumerate(files):
+        cv2.imwrite(str(file), (90 + 30 * i + 30 * np.sin(x / 9) * np.cos(y / 7)).astype(np.uint8))
+    seen = cameras.add_camera(scene.collection, camera)
+    clip = clips.load_clip("R", files[0], camera)
+    clip.frame_start, scene.camera = 10, seen
+    footage_plane.add_screen(scene.collection, seen, camera, clip, files)
+    floor = surroundings.add_floor(scene.collection)
+    assert not footage_plane.shown(scene)
+    before = scene.view_settings.view_transform
+    footage_plane.show(scene, True)
+    assert footage_plane.shown(scene) and floor.hide_render
+    cameras.frame_render(scene, camera)
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    scene.cycles.pixel_filter_type = "BOX"
+    scene.render.filepath, scene.render.image_settings.file_format = str(tmp_path / "out.png"), "PNG"
+    scene.frame_set(11)
+    empty.ops.render.render(write_still=True)
+    got, wanted = (
+        cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_GRAYSCALE),
+        undistorted(cv2.imread(str(files[1]), cv2.IMREAD_GRAYSCALE), camera),
+    )
+    inside = np.s_[6:-6, 6:-6]
+    difference = got[inside].astype(float) - wanted[inside]
+    assert np.median(np.abs(difference)) < 2.0 and abs(difference.mean()) < 1.0  # of 255; the next frame is brighter by 30
+    footage_plane.show(scene, False)
+    assert not footage_plane.shown(scene) and not floor.hide_render and scene.view_settings.view_transform == before
