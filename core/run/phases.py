@@ -6,17 +6,19 @@ from ..foundation.progress import Course
 
 # Names as in Monitor.step -> seconds once and a frame: a whole body in three views of 768×576 pixels, on two cores
 COST: dict[str, dict[str, tuple[float, float]]] = {
-    "measure": {"seeds": (0.5, 0.06), "surface": (1.5, 1.0)},
-    "track": {"tracks": (0.5, 0.33)},
+    "measure": {"seeds": (2.0, 0.15), "surface": (0.5, 0.35)},
+    "track": {"tracks": (0.5, 0.25)},
     "fit": {
-        "background": (1.0, 0.05),
+        "background": (0.5, 0.08),
         "fit the click frame": (6.0, 0.0),
-        "fit frame after frame": (0.0, 0.6),
+        "fit frame after frame": (0.0, 0.4),
         "follow the limbs": (0.0, 0.25),
-        "adjust the sequence": (0.0, 0.6),
-        "sigmas of the fit": (0.5, 0.03),
-        "skin": (0.4, 0.005),
-        "silhouettes": (4.0, 0.0),
+        "adjust the sequence": (0.0, 0.36),
+        "sigmas of the fit": (0.5, 0.12),
+        "relief": (7.0, 0.03),
+        "texture": (4.0, 0.0),
+        "skin": (0.4, 0.02),
+        "silhouettes": (2.5, 0.0),
     },
     "report": {"report": (2.5, 0.01)},
 }
