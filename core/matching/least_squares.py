@@ -311,7 +311,8 @@ class PatchTemplates:
             if required and iteration > HOPELESS_AFTER:
                 lost |= rho < self._settings.min_correlation - HOPELESS_BELOW
             near, spared = self._converged(step, moved, work.sigma(rho), ending)
-            lost |= self._given_up(alive & lost, place, spare)
+            if spare < len(images) and (alive & lost).any():
+                lost |= self._given_up(alive & lost, place, spare)
             finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
             here = place[finished]
             rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
