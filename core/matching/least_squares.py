@@ -43,17 +43,17 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from .parameter_sets import PARAMETERS, reduced_sets
 from .patches import compare, patch_offsets, template_pixels
+from .warps import compose, starts_at_work
 
 LARGEST = 4096  # patches of a piece
 SHARED_FROM = 513  # patches from which on threads share them
 MIN_CONDITION = 1e-6  # added to the scaled diagonal of the whole one
-MAX_STEP_PX = 2.0  # px, longer steps are shortened
-MIN_DETERMINANT = 0.1  # of I + B; a smaller one has no usable inverse
 COMPACT_BELOW = 0.75  # of the patches at work: if fewer still move, the others are taken out of the arrays
 GRADIENT_NOISE = 0.45  # of (6)
 CURVATURE_RATE = 0.1  # smallest λ of (6)
 LINEAR_PX = 0.25  # px by which any part of the patch may move for (6) to apply
 SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled for the reported sigma0
+APPROXIMATE_ITERATIONS = 8  # after which an approximate match has not converged yet; nine in ten have by then
 HOPELESS_AFTER = 6  # iterations, after which an approximate match gives up
 HOPELESS_BELOW = 0.15  # by so much below the smallest correlation; of 13,000 points in 8 frames of two persons it takes 8
 INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
@@ -290,12 +290,13 @@ class PatchTemplates:
     ) -> "_Settled":
         """The results of (2) and (3) for the patches that begin as NOT_CONVERGED."""
         most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
-        ending = APPROXIMATE if required else Ending(step_px=self._settings.converged_px)
+        most, ending = (min(most, APPROXIMATE_ITERATIONS), APPROXIMATE) if required else (most, Ending(step_px=self._settings.converged_px))
         c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
         alive = status == MatchStatus.NOT_CONVERGED
-        harmless = _starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
+        harmless = starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
         spare = len(images) - required if required else len(images)  # images in which a point may fail
-        alive &= ~self._given_up(~alive, np.arange(len(c)), spare)
+        vain = alive & self._given_up(~alive, np.arange(len(c)), spare)
+        status[vain], alive = MatchStatus.NOT_TRIED, alive & ~vain
         place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, harmless), np.where(alive[:, None, None], A, np.eye(2))
         work = _AtWork(self, images, place)
         for iteration in range(1, most + 1):
@@ -309,10 +310,13 @@ class PatchTemplates:
             lost = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
             status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
             if required and iteration > HOPELESS_AFTER:
-                lost |= rho < self._settings.min_correlation - HOPELESS_BELOW
+                hopeless = rho < self._settings.min_correlation - HOPELESS_BELOW
+                status[place[alive & hopeless & ~lost]] = MatchStatus.LOW_CORRELATION
+                lost |= hopeless
             near, spared = self._converged(step, moved, work.sigma(rho), ending)
             if spare < len(images) and (alive & lost).any():
-                lost |= self._given_up(alive & lost, place, spare)
+                vain = alive & ~lost & self._given_up(alive & lost, place, spare)
+                status[place[vain]], lost = MatchStatus.NOT_TRIED, lost | vain
             finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
             here = place[finished]
             rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
@@ -400,15 +404,6 @@ class _Settled:
         return _Settled(**{f.name: getattr(self, f.name)[rows] for f in fields(_Settled)})
 
 
-def _starts_at_work(start: np.ndarray, alive: np.ndarray, images: int) -> np.ndarray:
-    """For each row (N · images, 2) a place among the starts of its image that are `alive`: no other part of it is to be interpolated."""
-    by_image, there = start.reshape(images, -1, 2), alive.reshape(images, -1)
-    if not there.size:
-        return start
-    first = np.where(there.any(axis=1)[:, None], by_image[np.arange(images), there.argmax(axis=1)], 0.0)
-    return np.repeat(first, there.shape[1], axis=0)
-
-
 class _AtWork:
     """The patches of a piece that still move: the rows `place` (m,) of all patches in all images, image after image."""
 
@@ -439,21 +434,3 @@ class _AtWork:
         """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
         variance = self._contrast.astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / self._dof
         return np.asarray(np.sqrt(variance * np.maximum(self._inverse[:, 0, 0], self._inverse[:, 3, 3])))
-
-
-def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px].  (3)"""
-    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
-    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
-    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
-    det = a * e - b * d
-    inverse = 1 / np.where(np.abs(det) < MIN_DETERMINANT, np.nan, det)
-    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
-    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
-    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
-    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
-    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
-    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
-    if bad.any():
-        A_new[bad], move[bad] = A[bad], 0.0
-    return c - move, A_new, moved
