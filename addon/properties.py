@@ -160,6 +160,16 @@ def register() -> None:
             set=lambda group, value: [foot_lock.activate(body, value) for body in standing.all_bodies(group.id_data)],
             description="Let the foot lock act; without it the feet move as measured",
         ),
+        "floor_m": bpy.props.FloatProperty(
+            name="Floor",
+            options=set(),
+            unit="LENGTH",
+            precision=3,
+            get=lambda group: standing.floor_of(group.id_data),
+            set=lambda group, value: standing.stand_on(group.id_data, value),
+            description="Height of the floor. It is found from the standing feet. Set Floor, in the sidebar of the Clip Editor, finds "
+            "it from a place that you click in two views",
+        ),
         "render_footage": bpy.props.BoolProperty(
             name="Footage in Renders",
             options=set(),

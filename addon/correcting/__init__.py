@@ -4,9 +4,17 @@ import bpy
 
 
 def _classes() -> tuple[type, ...]:
-    from . import fit_again, operators, panel, properties, pull_joint, review
+    from . import fit_again, operators, panel, properties, pull_joint, review, set_floor
 
-    return (*properties.CLASSES, *operators.CLASSES, *pull_joint.CLASSES, *fit_again.CLASSES, *review.CLASSES, *panel.CLASSES)
+    return (
+        *properties.CLASSES,
+        *operators.CLASSES,
+        *pull_joint.CLASSES,
+        *fit_again.CLASSES,
+        *review.CLASSES,
+        *set_floor.CLASSES,
+        *panel.CLASSES,
+    )
 
 
 def register() -> None:

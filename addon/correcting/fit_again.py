@@ -11,9 +11,9 @@ from .. import project
 from ..editing.curves import keys_of
 from ..operators.stages import Fit, StageOperator, run_and_read
 from ..overlay import canvas, results
-from ..scene.action import MEASURED_KEY, set_keys
+from ..scene.action import set_keys
 from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
-from ..scene.standing import LIFT_KEY, Standing, all_bodies, curves_of
+from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, curves_of
 
 if TYPE_CHECKING:
     from ...core.run.around_clicks import FittedAgain

@@ -54,6 +54,7 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
         column.operator("tricap.remove_trajectory", icon="TRACKER")
         column.operator("tricap.remove_region", icon="MESH_PLANE")
         column.prop(correcting, "region_frames")
+        layout.operator("tricap.set_floor", icon="GRID")
         if correcting.corrections:
             row = layout.row()
             row.template_list("TRICAP_UL_corrections", "", correcting, "corrections", correcting, "active", rows=3)

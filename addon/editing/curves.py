@@ -7,9 +7,8 @@ import bpy
 import numpy as np
 
 from ...core.foundation.errors import InputError
-from ..scene.action import MEASURED_KEY, UNCERTAINTY
-from ..scene.armature import RIG_KEY
-from ..scene.standing import curves_of
+from ..scene.action import UNCERTAINTY
+from ..scene.standing import MEASURED_KEY, RIG_KEY, curves_of
 
 EDITED = "Edited motion"
 BONE = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.?(.*)')

@@ -21,8 +21,8 @@ from mathutils import Matrix, Vector
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
-from ..scene.armature import RIG_KEY, SNAPS_KEY
-from ..scene.standing import ROOT
+from ..scene.armature import SNAPS_KEY
+from ..scene.standing import RIG_KEY, ROOT
 from . import metarig
 from .playing import played_frames
 from .read import orthonormal, read_motion, read_rig, world_matrix

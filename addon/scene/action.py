@@ -14,10 +14,9 @@ from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
 from ...core.motion.retarget.rig import needed_keys
 from . import armature
-from .standing import DOFS_KEY, Standing
+from .standing import DOFS_KEY, MEASURED_KEY, Standing
 
 NAME, SIMPLE_NAME, UNCERTAINTY = "Measured motion", "Simplified motion", "Uncertainty"
-MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
 METRES_PER_RADIAN = 0.2  # converts the tolerance of angles to the base's location: 1° corresponds to 3.5 mm
 LIMITS_TOLERANCE_RAD = 1e-6  # overstepping below this is rounding
 

@@ -24,7 +24,6 @@ ROOT_LENGTH_M = 0.1
 NAME = "Body"
 PALETTES = {".R": "THEME01", ".L": "THEME04"}  # colours of the sides: red and blue; the middle is yellow
 ROLES_KEY = "tricap_roles"  # custom property of armature data: the bone of each part of the body
-RIG_KEY = "tricap_control_rig"  # custom property of the body's object: its control rig
 SNAPS_KEY = "tricap_snaps"  # custom property of a control rig: by limb, the arguments of Rigify's snapping
 JOINTS_KEY = "tricap_joints"  # custom property of armature data: by joint, a bone that begins or ends there
 

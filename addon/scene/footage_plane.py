@@ -13,7 +13,7 @@ import numpy as np
 from ...core.geometry.camera import Camera, image_of, interior_of
 from .. import folders
 from . import nodes
-from .surroundings import FLOOR
+from .standing import FLOOR
 
 NAME = "Footage"
 DISTANCE_M = 200.0

@@ -17,11 +17,16 @@ import numpy as np
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import bone_frames
+from ...core.foundation.errors import InputError
 from ..session import get_session
 
 ROOT = "root"
 LIFT_KEY = "tricap_lift_m"  # custom property of armature data: by how much the rest pose of a standing body is raised
 DOFS_KEY = "tricap_dofs"  # custom property of armature data: bone, path and index of the channel of each DOF
+RIG_KEY = "tricap_control_rig"  # custom property of the body's object: its control rig
+MEASURED_KEY = "tricap_measured_motion"  # custom property of the body's object: the measured action while another one plays
+FLOOR_KEY = "tricap_floor_m"  # custom property of the scene: the height of its floor, where the user chose it
+FLOOR = "Floor"  # the name of its object
 OBJECT_PATH = "location"
 FEET = ("foot.L", "foot.R")
 
@@ -123,13 +128,59 @@ def carry_path(scene: bpy.types.Scene, by: Path) -> None:
     get_session().file.changed = True
 
 
-def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """The curves of x and y of the path, in every action that the body plays."""
+def floor_of(scene: bpy.types.Scene) -> float:
+    """The height [m] of the floor on which the scene's body stands; that of the scene's own choice without one, or zero."""
+    body = next(bodies(scene), None)
+    return float(body.location.z if body is not None else scene.get(FLOOR_KEY, 0.0))
+
+
+def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
+    """Put the floor to a height: the rest pose and the root of the bodies stand there, and their motion in the world stays as it is.
+
+    Raises:
+        InputError: a control rig carries the body.
+    """
+    for body in bodies(scene):
+        if body.get(RIG_KEY) is not None and body[RIG_KEY].name in scene.objects:
+            raise InputError(
+                f"“{body[RIG_KEY].name}” drives “{body.name}”; set the floor before the control rig is made, or delete that first."
+            )
+    scene[FLOOR_KEY] = height_m
+    for body in bodies(scene):
+        lower_m, body.location.z = height_m - body.location.z, height_m
+        height = next((dof for dof in body.data[DOFS_KEY].values() if dof["path"] == "location" and dof["bone"] != ROOT), None)
+        if height is None:
+            continue
+        bone = body.pose.bones[height["bone"]]
+        shift = -lower_m * float(np.sign(bone.bone.matrix_local[2][height["index"]]))
+        path = bone.path_from_id("location")
+        bone.location[height["index"]] += shift
+        for curve in (curve for action in _actions(body) for curve in curves_of(action)):
+            if curve.data_path == path and curve.array_index == height["index"]:
+                for point in curve.keyframe_points:
+                    point.co[1], point.handle_left[1], point.handle_right[1] = (
+                        at[1] + shift for at in (point.co, point.handle_left, point.handle_right)
+                    )
+                curve.update()
+        body.update_tag()
+    for thing in scene.objects:
+        if thing.name.split(".")[0] == FLOOR:
+            thing.location.z = height_m
+    scene.frame_set(scene.frame_current)
+    get_session().file.changed = True
+
+
+def _actions(body: bpy.types.Object) -> set[bpy.types.Action]:
+    """The actions that move a body: the active one, those in its layers, and the measured one."""
     data = body.animation_data
     strips = [strip.action for track in data.nla_tracks for strip in track.strips] if data is not None else []
-    actions = {action for action in (data.action if data is not None else None, *strips) if action is not None}
+    return {action for action in (data.action if data is not None else None, body.get(MEASURED_KEY), *strips) if action is not None}
+
+
+def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """The curves of x and y of the path, in every action that the body plays."""
     paths = (OBJECT_PATH, body.pose.bones[ROOT].path_from_id("location"))
-    return [curve for action in actions for curve in curves_of(action) if curve.data_path in paths and curve.array_index < 2]
+    return [curve for action in _actions(body) for curve in curves_of(action) if curve.data_path in paths and curve.array_index < 2]
 
 
 def bags_of(action: bpy.types.Action) -> list[bpy.types.ActionChannelbag]:

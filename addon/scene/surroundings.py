@@ -7,10 +7,10 @@ import numpy as np
 
 from . import nodes
 from .cloud import write
+from .standing import FLOOR
 from .trajectories import trail_group
 
 LIGHTS = (("Key light", 3.0, (50.0, 0.0, 35.0)), ("Fill light", 1.0, (60.0, 0.0, -70.0)))  # name, W/m², direction in degrees
-FLOOR = "Floor"
 SQUARE_M, MARGIN_M = 0.5, 6.0  # of the floor: its squares, and its size around a person who stays in one place
 BACKGROUND = (0.32, 0.33, 0.35)  # of renders, in a scene without a world
 FLOOR_COLOUR, BAR_COLOUR = (0.35, 0.36, 0.38), (0.9, 0.75, 0.1)

@@ -202,6 +202,9 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
         row = layout.row()
         row.enabled = rig_of(body) is None  # a control rig carries the path itself
         row.prop(context.scene.tricap, "path")
+        row = layout.row()
+        row.enabled = rig_of(body) is None
+        row.prop(context.scene.tricap, "floor_m")
         control_rig.draw(layout, body)
     edited = next(standing.all_bodies(context.scene), None)
     if edited is not None:

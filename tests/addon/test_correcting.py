@@ -1,6 +1,7 @@
 """Corrections, locks and limits: in the scene, in take.toml, undone, and in effect."""
 
 import importlib
+import json
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -156,3 +157,17 @@ def test_a_joint_that_is_pulled_is_clicked_in_every_view(blender: ModuleType, sc
         blender.ops.tricap.pull_joint(name="tail", view="L", x=50, y=60)
     with pytest.raises(RuntimeError, match="No body was fitted in frame 99"):
         blender.ops.tricap.pull_joint(name="wrist.R", view="L", frame=99, x=50, y=60)
+
+
+def test_the_floor_is_clicked_in_two_views(blender: ModuleType, scene: Any, small_run: SmallRun) -> None:
+    place = np.array([-0.1, 0.3, -0.12])
+    at = {camera.name: (camera.project(place) + 0.5).tolist() for camera in small_run.rig.cameras}
+    assert blender.ops.tricap.set_floor(clicks=json.dumps([["L", *at["L"]], ["R", *at["R"]]])) == {"FINISHED"}
+    assert scene.tricap.floor_m == pytest.approx(-0.12, abs=0.01)
+    for clicks, why in {
+        "L": "not a list", json.dumps([["L", *at["L"]]]): "in two views", json.dumps([["L", 1, 2], ["X", 3, 4]]): "no view “X”",
+        json.dumps([["L", *at["L"]], ["R", at["R"][0], at["R"][1] + 60]]): "rays miss each other",
+    }.items():  # fmt: skip
+        with pytest.raises(RuntimeError, match=why):
+            blender.ops.tricap.set_floor(clicks=clicks)
+    assert scene.tricap.floor_m == pytest.approx(-0.12, abs=0.01)

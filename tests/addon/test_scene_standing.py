@@ -100,6 +100,23 @@ def test_the_rest_pose_stands_on_the_floor_and_the_root_carries_the_path(empty: 
     assert {bone.color.palette for bone in body.data.bones} == {"THEME01", "THEME04", "THEME09"}
 
 
+def test_another_floor_leaves_the_motion_in_the_world(empty: ModuleType, out: Path) -> None:
+    from tricap.addon.scene import standing
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(out)
+    scene, body, names = empty.context.scene, empty.data.objects["Body"], ("pelvis", "foot.L", "head")
+    before, other = placed(empty, body, names), FLOOR_M + 0.07
+    standing.stand_on(scene, other)
+    assert standing.floor_of(scene) == pytest.approx(other) and empty.data.objects["Floor"].location.z == pytest.approx(other)
+    np.testing.assert_allclose(placed(empty, body, names), before, atol=5e-6)
+    np.testing.assert_allclose(placed(empty, body, ("root",))[:, 0, 2, 3], other, atol=1e-5)
+    build_scene(out)
+    body = empty.data.objects["Body"]
+    assert body.location.z == pytest.approx(other, abs=1e-6), "a scene that is built again keeps its floor"
+    np.testing.assert_allclose(placed(empty, body, names), before, atol=5e-6)
+
+
 def test_the_scene_is_tidy_and_a_render_shows_the_body(empty: ModuleType, out: Path) -> None:
     from tricap.addon.scene.build import build_scene
 
