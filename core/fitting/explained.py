@@ -24,7 +24,7 @@ from .limb import Limb
 from .segmentation import facing_bone, gap_to_bone, near_pairs
 from .state import BodyState, ShapeParameters, free_bones
 
-MOST_POINTS = 500  # of a frame
+MOST_POINTS, MOST_NEAR = 1000, 400  # of a frame, and near a limb
 COARSE = 3  # points and cells as one, for a first choice among many poses
 CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of measured points
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
@@ -105,7 +105,9 @@ class Evidence:
         reach = float(state.lengths_m[limb.outer].sum()) + BEYOND_M
         close = np.flatnonzero(np.linalg.norm(self.points.xyz_m - at, axis=1) < reach)
         taken = _points_explained(self.points.take(close), state, rest, TAKEN_M)
-        left = taken < EXPLAINED
+        left = np.flatnonzero(taken < EXPLAINED)
+        every = 1 + (len(left) - 1) // MOST_NEAR if len(left) else 1
+        left = left[::every]
         views, shares = [], []
         for view in self.cells:
             pixel, depth = view.camera.project(at[None])[0], float(view.camera.to_camera(at[None])[0, 2])
@@ -113,7 +115,8 @@ class Evidence:
             share = _cells_explained(around, state, rest, self.reach, TAKEN_CELLS_M)
             views.append(around.take(share < EXPLAINED))
             shares.append(share[share < EXPLAINED])
-        return replace(self, points=self.points.take(close[left]), taken=taken[left], cells=views, taken_cells=shares)
+        points, area = self.points.take(close[left]), self.point_area * every
+        return replace(self, points=points, taken=taken[left], point_area=area, cells=views, taken_cells=shares)
 
     def thinned(self) -> "Evidence":
         """Every `COARSE`th point and cell, each for so many."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 9"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 10"  # part of the fit's key: raise it when the same input gives another body
 START_ALONE = ("full",)  # models whose joints need no clicks; a part of them starts alone where the whole person is visible
 
 
@@ -37,6 +37,9 @@ class FitSettings:
         "measured",
         "The points that attract the body: the whole measured surface, or those that were tracked from frame to frame.",
         choices=("measured", "tracked"),
+    )
+    complete_surface: bool = knob(
+        True, "Where no patch could be matched, fit the body to a coarser surface, by semi-global matching inside the person's outline."
     )
     use_trajectories: bool = knob(
         True, "Tracked points stay at their places in the limbs: they determine twist, sliding, centres of the joints."

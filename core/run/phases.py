@@ -10,6 +10,7 @@ COST: dict[str, dict[str, tuple[float, float]]] = {
     "track": {"tracks": (0.5, 0.25)},
     "fit": {
         "background": (0.5, 0.08),
+        "coarse surface": (0.2, 0.2),
         "fit the click frame": (6.0, 0.0),
         "fit frame after frame": (0.0, 0.4),
         "follow the limbs": (0.0, 0.25),

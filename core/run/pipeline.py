@@ -4,6 +4,7 @@ Every stage asks the stages before it for their results. What has a checkpoint i
 """
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from ..body.skin.texture import TextureBaker
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
-from ..fitting.inputs.cloud_points import tracked_clouds
-from ..fitting.inputs.fit_input import FitInput
+from ..fitting.inputs.cloud_points import Cloud, tracked_clouds
+from ..fitting.inputs.completed_clouds import completed_clouds
+from ..fitting.inputs.fit_input import BackgroundDistances, FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
@@ -256,7 +258,8 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     fitting = run.settings["fitting"]
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
     tracked = tracked_clouds(run.trajectories, run.footage.frames) if fitting.cloud == "tracked" and run.trajectories else None
-    given = fit_input(run.footage, tracked or run.clouds, run.trajectories, run.results, background)
+    clouds = tracked or _completed(run, background, monitor)
+    given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
     given = with_start(given, fitting, monitor)
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
     _write_body(run, body, monitor)
@@ -266,6 +269,13 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     outlines = outline_polygons(run.footage, run.results)
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again
+
+
+def _completed(run: Run, background: Sequence[BackgroundDistances], monitor: Monitor) -> Sequence[Cloud]:
+    """The clouds, with the coarse surface of the person where nothing was measured."""
+    if not run.settings["fitting"].complete_surface or run.surfaceless:
+        return run.clouds
+    return completed_clouds(run.footage, run.clouds, background, run.results, monitor)
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:

@@ -54,6 +54,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "residual": "paper",
             "use_trajectories": False,
             "use_background": False,
+            "complete_surface": False,
             "place_joints": "off",
         },
     },
