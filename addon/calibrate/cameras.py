@@ -131,7 +131,7 @@ def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
 def exact_values(camera: Camera) -> list[float]:
     """All numbers of a camera in double precision."""
     parts = (camera.matrix, camera.distortions, camera.affinity, camera.R_cam_world, camera.t_cam_world_m)
-    return [float(v) for part in parts for v in part.ravel()]
+    return [*(float(v) for part in parts for v in part.ravel()), float(camera.fisheye)]
 
 
 def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
@@ -143,6 +143,7 @@ def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
         affinity=values[14:16],
         R_cam_world=values[16:25].reshape(3, 3),
         t_cam_world_m=values[25:28],
+        fisheye=len(values) > 28 and bool(values[28]),
     )
 
 
@@ -154,5 +155,6 @@ def _unchanged(read: Camera, values: np.ndarray, has_lens: bool) -> bool:
     got = np.array([read.matrix[0, 0], read.matrix[1, 1], *read.matrix[:2, 2], *read.R_cam_world.ravel(), *read.t_cam_world_m])
     pixels = SAME * max(read.size_px) * 4
     scale = np.array([fx * SAME * 4, fx * SAME * 4, pixels, pixels, *[SAME] * 9, *[SAME * (1 + np.abs(exact.t_cam_world_m).max()) * 4] * 3])
-    distorted = has_lens and np.abs(read.distortions - exact.distortions).max() > SAME * max(1.0, np.abs(exact.distortions).max())
+    shown = np.zeros(5) if exact.fisheye else exact.distortions  # by the clip
+    distorted = has_lens and np.abs(read.distortions - shown).max() > SAME * max(1.0, np.abs(shown).max())
     return bool((np.abs(expected - got) <= scale).all() and not distorted)

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ...core.calibration.boards.board import Board, BoardKind, write_board
+from ...core.calibration.boards.board import Board, BoardKind, Lens, write_board
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
 from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
@@ -86,7 +86,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         length, diameter = (typed(value) for value in (self.length_m or props.length_m, props.diameter_m))
         mask = folders.absolute(props.mask) if props.mask else None
         interlaced, first_field = props.interlaced, props.first_field
-        focal = props.focal_px if props.focal_px > 0 else None
+        focal, lens = props.focal_px if props.focal_px > 0 else None, Lens(props.lens)
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
         board = None if props.target == "WAND" else board_of(props)
@@ -102,7 +102,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
             assert board is not None
             footage = calibrate.open_boards(folder)
             observations = measure_boards(footage, board, monitor, note_count)
-            result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, world=world)
+            result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
             write(result, out)
             return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out)
 

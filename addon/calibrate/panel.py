@@ -52,6 +52,7 @@ def _board(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
     if props.target == "charuco":
         layout.prop(props, "marker_m")
         layout.prop(props, "dictionary")
+    layout.prop(props, "lens")
     layout.operator("tricap.print_board", icon="EXPORT")
 
 

@@ -76,6 +76,15 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         description="Which fields of interlaced footage are measured",
     )
     first_field: bpy.props.EnumProperty(name="Field Order", items=FIELD_ORDERS, description="Which field was exposed first")  # type: ignore[valid-type]
+    lens: bpy.props.EnumProperty(
+        name="Lens",
+        items=[  # type: ignore[valid-type]
+            ("auto", "Automatic", "Of each camera the model that fits its images"),
+            ("brown", "Brown", "Radial and tangential distortion"),
+            ("fisheye", "Fisheye", "OpenCV's fisheye lens"),
+        ],
+        description="Model of the lenses",
+    )
     focal_px: bpy.props.FloatProperty(
         name="Approximate Focal Length [px]",
         default=0.0,

@@ -97,6 +97,8 @@ def principal_point_bottom_up_px(camera: Camera) -> tuple[float, float]:
 
 
 def brown_coefficients(camera: Camera) -> dict[str, float]:
-    """The coefficients of the tracker's Brown model under its own names.  (5)"""
+    """The coefficients of the tracker's Brown model under its own names, 0 for a fisheye lens, which Blender does not have.  (5)"""
+    if camera.fisheye:
+        return dict.fromkeys(("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2"), 0.0)
     k1, k2, p1, p2, k3 = (float(value) for value in camera.distortions)
     return dict(brown_k1=k1, brown_k2=k2, brown_k3=k3, brown_k4=0.0, brown_p1=p2, brown_p2=-p1)

@@ -43,6 +43,11 @@ def frame_faults(rig: Rig, reference: Camera) -> list[str]:
     faults = []
     w, h = reference.size_px
     for camera in rig.cameras:
+        if camera.fisheye:
+            faults.append(
+                f"Camera {camera.name} has a fisheye lens, which Blender's clips do not have: the footage behind it is not undistorted. "
+                "Compare body and footage in the Clip Editor, where they agree."
+            )
         if camera.size_px[0] * h != camera.size_px[1] * w:
             faults.append(
                 f"Camera {camera.name} has another aspect ratio than {reference.name};"

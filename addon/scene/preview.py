@@ -77,7 +77,7 @@ def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
     f, cx, cy, b1 = interior[0], *interior[1:3], interior[8]
     y, x = np.indices(grey.shape, dtype=np.float64)
     rays = np.stack([(x - cx) / (f * (1 + b1)), (y - cy) / f, np.ones(grey.shape)], axis=-1)
-    places = image_of(interior, rays.reshape(-1, 3)).reshape(*grey.shape, 2).astype(np.float32)
+    places = image_of(interior, rays.reshape(-1, 3), camera.fisheye).reshape(*grey.shape, 2).astype(np.float32)
     return np.asarray(cv2.remap(grey.astype(np.float32), places, None, cv2.INTER_LINEAR))
 
 

@@ -104,7 +104,7 @@ def residuals(network: Network, xy_px: np.ndarray) -> np.ndarray:
     """Observed − computed (N, C, K, 2); NaN where there is no observation, huge where a point lies behind its camera."""
     p = _in_cameras(network)
     ahead = p[:, 2:] > NEAREST_M
-    image = image_of(network.interior, np.moveaxis(np.where(ahead, p, 1.0), 1, 2))  # (C, K N, 2)
+    image = image_of(network.interior, np.moveaxis(np.where(ahead, p, 1.0), 1, 2), network.fisheye)  # (C, K N, 2)
     image = np.where(ahead[:, 0, :, None], image, BEHIND_PX).reshape(len(p), xy_px.shape[2], -1, 2)
     with np.errstate(invalid="ignore"):
         return np.clip(xy_px - image.transpose(2, 0, 1, 3), -BEHIND_PX, BEHIND_PX)
@@ -139,7 +139,7 @@ def design(network: Network, unknowns: Unknowns, velocity_px: np.ndarray | None 
     p = _in_cameras(network)
     C, N = len(p), network.count
     p = np.where(p[:, 2:] > NEAREST_M, p, [[0.0], [0.0], [1e3]])
-    image, J_interior, G = columns_of_derivatives(network.interior, p)
+    image, J_interior, G = columns_of_derivatives(network.interior, p, network.fisheye)
     J = [J_interior[:, np.flatnonzero(unknowns.free)], columns_of_exterior(G, p)]
     if unknowns.with_delays:
         moving = np.zeros(image.shape) if velocity_px is None else velocity_px.transpose(1, 3, 2, 0).reshape(image.shape)

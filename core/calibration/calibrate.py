@@ -19,6 +19,7 @@ from ..images.interlace import FieldLayout, field_layout
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_sequence, read_image
 from . import report, verdict
 from .bars import BarObservations
+from .boards.board import Lens
 from .boards.calibration import calibrate_boards
 from .boards.footage import BoardFootage, numbered
 from .boards.observations import BoardObservations
@@ -249,6 +250,7 @@ def calibrate_rig(
     monitor: Monitor,
     *,
     focal_px: float | None = None,
+    lens: Lens = Lens.AUTO,
     world: WorldChoice | None = None,
 ) -> CalibratedRig:
     """Calibrate from the observations of the bar or the board, judge the result, and put it into the world's frame.
@@ -258,9 +260,11 @@ def calibrate_rig(
     """
     world = world or WorldChoice()
     if isinstance(observations, BarObservations):
+        if lens is Lens.FISHEYE:
+            raise InputError("A fisheye lens cannot be calibrated with a bar; film a printed board, and give --board (in Blender: Target).")
         calibration = calibrate(observations, monitor, focal_px)
     else:
-        calibration = calibrate_boards(observations, monitor, focal_px)
+        calibration = calibrate_boards(observations, monitor, focal_px, lens)
     verdict.refuse_if_useless(calibration)
     calibration = in_world(calibration, world)
     quality = assess(calibration, monitor)

@@ -85,6 +85,7 @@ class Network:
     interior: np.ndarray  # (C, 10), see INTERIOR
     R: np.ndarray  # (C, 3, 3) world → camera
     t: np.ndarray  # (C, 3) m
+    fisheye: np.ndarray | bool = False  # (C,) which cameras have a fisheye lens
     delay_images: np.ndarray | None = None  # (C,) by which each camera is later than the first; None: all at once
 
     unknowns: ClassVar[int]  # q, of a position
@@ -135,9 +136,16 @@ class Network:
     def cameras(self, names: Sequence[str], size_px: np.ndarray) -> tuple[Camera, ...]:
         """The cameras as values of the geometry package."""
         return tuple(
-            camera_of(name, (int(size[0]), int(size[1])), p, R, t)
-            for name, size, p, R, t in zip(names, size_px, self.interior, self.R, self.t)
+            camera_of(name, (int(size[0]), int(size[1])), p, R, t, bool(curved))
+            for name, size, p, R, t, curved in zip(
+                names, size_px, self.interior, self.R, self.t, np.broadcast_to(self.fisheye, len(self.R))
+            )
         )
+
+    @property
+    def curved(self) -> np.ndarray:
+        """(C,) which cameras have a fisheye lens."""
+        return np.broadcast_to(self.fisheye, len(self.R))
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Self:
         """The same positions with other cameras."""
@@ -146,6 +154,7 @@ class Network:
             interior=np.stack([interior_of(c) for c in cameras]),
             R=np.stack([c.R_cam_world for c in cameras]),
             t=np.stack([c.t_cam_world_m for c in cameras]),
+            fisheye=np.array([c.fisheye for c in cameras]),
         )
 
 

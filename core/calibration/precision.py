@@ -90,7 +90,7 @@ def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.n
         q = camera.to_camera(xyz_m)
         visible = (q[:, 2] > NEAREST_M) & camera.sees(camera.project(xyz_m))
         q = np.where(visible[:, None], q, [0.0, 0.0, 1.0])
-        _, J_interior, G = image_with_derivatives(interior_of(camera), q)
+        _, J_interior, G = image_with_derivatives(interior_of(camera), q, camera.fisheye)
         J = np.concatenate([J_interior, exterior_derivatives(G, q)], axis=-1)[..., unknowns.columns]
         GR = (G @ camera.R_cam_world) * visible[:, None, None]
         N += GR.transpose(0, 2, 1) @ GR

@@ -35,14 +35,15 @@ TILT = np.tan(np.radians(25))  # of a bar that is upright in the image
 RADIAL_SIGMA = (0.5, 0.3, 0.15)  # k1 ρ², k2 ρ⁴, k3 ρ⁶ at the corner, ρ in units of f
 DECENTRING_SIGMA = 0.01  # p ρ
 AFFINITY_SIGMA = 0.01
+NOTHING = 1e-6  # of an unknown that is always 0
 CENTRE_SIGMA = 0.08  # of the image width
 FOCAL_SIGMA = 1.5  # of f
 
 Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
 
 
-def lens_prior(size_px: np.ndarray, focal_px: np.ndarray) -> Unknowns:
-    """The prior of the interior unknowns of C cameras, with all ten free."""
+def lens_prior(size_px: np.ndarray, focal_px: np.ndarray, fisheye: np.ndarray | bool = False) -> Unknowns:
+    """The prior of the interior unknowns of C cameras, with all ten free; what a `fisheye` lens (C,) does not have is fixed at 0."""
     C = len(size_px)
     expected, sigma = np.zeros((C, len(INTERIOR))), np.ones((C, len(INTERIOR)))
     rho = np.linalg.norm(size_px, axis=1) / 2 / focal_px
@@ -51,6 +52,8 @@ def lens_prior(size_px: np.ndarray, focal_px: np.ndarray) -> Unknowns:
     for n, part in enumerate(RADIAL_SIGMA):
         sigma[:, 3 + n] = part / rho ** (2 * n + 2)
     sigma[:, 6:8] = DECENTRING_SIGMA / rho[:, None]
+    curved = np.broadcast_to(fisheye, C)
+    sigma[curved, 6], sigma[curved, 7] = RADIAL_SIGMA[-1] / rho[curved] ** 8, NOTHING
     sigma[:, 8:10] = AFFINITY_SIGMA
     return Unknowns(free=np.ones(len(INTERIOR), dtype=bool), expected=expected, sigma=sigma)
 

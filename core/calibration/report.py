@@ -76,9 +76,15 @@ def parameters(calibration: Calibration, camera: int) -> list[tuple[str, float, 
     columns = list(calibration.unknowns.columns)
     p = len(columns)
     sigma = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
+    fisheye = bool(calibration.network.curved[camera])
     return [
-        (name, float(calibration.network.interior[camera, n]), float(sigma[camera * p + columns.index(n)]) if n in columns else 0.0)
+        (
+            "k4" if fisheye and name == "p1" else name,
+            float(calibration.network.interior[camera, n]),
+            float(sigma[camera * p + columns.index(n)]) if n in columns else 0.0,
+        )
         for n, name in enumerate(INTERIOR)
+        if not (fisheye and name == "p2")
     ]
 
 

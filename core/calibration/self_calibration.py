@@ -271,7 +271,7 @@ def without_insignificant(
     points: MovingPoints | None = None,
 ) -> Calibration:
     """Leave out the groups of lens parameters that are not significant, with a new adjustment after each.  (3)"""
-    unknowns = _with_delays(lens_prior(observations.size_px, state.network.interior[:, 0]), points)
+    unknowns = _with_delays(lens_prior(observations.size_px, state.network.interior[:, 0], state.network.fisheye), points)
     decisions: list[str] = []
     first, all_free = state.network, unknowns
     covariance = _covariance(state, keep, unknowns, sigma, points)

@@ -106,6 +106,9 @@ def _interior(camera: Camera) -> list[Finding]:
 
 def _folds(camera: Camera) -> bool:
     """Whether the distorted radius stops increasing inside the image:  d/dr (r L(r)) ≤ 0."""
+    if camera.fisheye:
+        t = np.linspace(0, np.arctan(camera.field_radius), 400) ** 2
+        return bool((1 + sum((2 * n + 3) * k * t ** (n + 1) for n, k in enumerate(camera.distortions[:4])) <= 0).any())
     k1, k2, _, _, k3 = camera.distortions
     w, h = camera.size_px
     corners = np.abs(np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]]) - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]

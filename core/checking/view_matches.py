@@ -75,6 +75,11 @@ def epipolar_distance_px(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndar
     E = cross_matrix(b.t_cam_world_m - R @ a.t_cam_world_m) @ R
     ya, yb = a.directions(xa_px), b.directions(xb_px)
     la, lb = ya @ E.T, yb @ E
+    if a.fisheye or b.fisheye:  # on the unit sphere, as f is pixels per radian
+        na, nb = np.linalg.norm(ya, axis=1), np.linalg.norm(yb, axis=1)
+        la, lb, yb = la / na[:, None], lb / nb[:, None], yb / nb[:, None]
+        length = np.sqrt((la**2).sum(axis=1) / b.focal_px**2 + (lb**2).sum(axis=1) / a.focal_px**2) / np.sqrt(2.0)
+        return np.asarray((yb * la).sum(axis=1) / np.maximum(length, 1e-30))
     length = np.sqrt((la[:, :2] ** 2).sum(axis=1) / b.focal_px**2 + (lb[:, :2] ** 2).sum(axis=1) / a.focal_px**2) / np.sqrt(2.0)
     return np.asarray((yb * la).sum(axis=1) / np.maximum(length, 1e-30))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ..calibration import report
 from ..calibration.bars import BarObservations
-from ..calibration.boards.board import Board, BoardKind, write_board
+from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, open_boards, write_report
@@ -93,7 +93,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
     if not args.format and args.out.is_dir():
         raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
     world = _world(args)
-    result = calibrate_rig(_observed(args, board, monitor), monitor, focal_px=args.focal_px, world=world)
+    result = calibrate_rig(_observed(args, board, monitor), monitor, focal_px=args.focal_px, lens=Lens(args.lens), world=world)
     written = [args.out]
     if args.report:
         written += write_report(args.report, result)[:1]

@@ -20,6 +20,7 @@ Adder = Callable[[Any], None]
 Action = Callable[[argparse.Namespace, Monitor], list[str]]
 RIG_FORMATS = ("agisoft", "anipose", "caliscope", "colmap", "easymocap", "opencv", "openptv", "pose2sim")  # of calibration/rig_files
 BOARDS = ("chessboard", "charuco")  # of calibration/boards
+LENSES = ("auto", "brown", "fisheye")
 WORKERS = 2  # of a batch, by default
 RETRIES = 3  # of a take whose worker died; one that dies more often probably lacks memory
 
@@ -147,6 +148,8 @@ def _calibrate(commands: Any) -> None:
     parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
     parser.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
     parser.add_argument("--marker", type=float, default=0.0, metavar="M", help="side of a marker in metres; three quarters of a square")
+    about = "with a board: the model of the lenses; auto: of each camera the one that fits its images"
+    parser.add_argument("--lens", choices=LENSES, default="auto", help=about)
     parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument(

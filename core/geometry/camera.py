@@ -7,6 +7,8 @@
     b' = b L + p1 (r² + 2 b²) + 2 p2 a b                                       (4)  OpenCV's order of p1, p2
     x = fx ((1 + b1) a' + b2 b') + cx ,  y = fy b' + cy                        (5)  b1 scale, b2 shear
 
+Of a fisheye lens, (3) and (4) are those of `fisheye`; in the order of `INTERIOR`, its k4 is in the place of p1, and p2 is 0.
+
 Pixels are (x, y), the centre of the top-left pixel is (0, 0), always in the FULL frame. Space is in metres.
 
 Derivatives of the camera's equations with respect to its own unknowns: 10 of the interior and 6 of the exterior orientation.
@@ -25,6 +27,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..foundation.arrays import frozen
+from . import fisheye as lens
 from .rotation import cross_matrix
 
 UNDISTORT_STEPS = 12  # of Newton's method
@@ -39,10 +42,11 @@ class Camera:
     name: str
     size_px: tuple[int, int]
     matrix: np.ndarray  # (3, 3) fx 0 cx / 0 fy cy / 0 0 1, pixels
-    distortions: np.ndarray = field(default_factory=lambda: np.zeros(5))  # k1 k2 p1 p2 k3
+    distortions: np.ndarray = field(default_factory=lambda: np.zeros(5))  # k1 k2 p1 p2 k3; of a fisheye lens k1 k2 k3 k4 0
     affinity: np.ndarray = field(default_factory=lambda: np.zeros(2))  # b1 scale, b2 shear
     R_cam_world: np.ndarray = field(default_factory=lambda: np.eye(3))
     t_cam_world_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size_px", (int(self.size_px[0]), int(self.size_px[1])))
@@ -89,6 +93,10 @@ class Camera:
         xy = np.asarray(xy_px, dtype=np.float64)
         inverse = np.linalg.inv(self._pixel_matrix())
         target = (xy - self.matrix[:2, 2]) @ inverse.T
+        if self.fisheye:
+            d = np.linalg.norm(target, axis=-1)
+            stretch = np.tan(lens.angle_of(self.distortions[:4], d)) / np.where(d > 0, d, 1.0)
+            return np.concatenate([target * np.where(d > 0, stretch, 1.0)[..., None], np.ones_like(target[..., :1])], axis=-1)
         a, b = target[..., 0], target[..., 1]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for _ in range(UNDISTORT_STEPS):
@@ -100,6 +108,14 @@ class Camera:
                 if np.nanmax(np.abs(residual), initial=0.0) < UNDISTORT_TOLERANCE:
                     break
         return np.stack([a, b, np.ones_like(a)], axis=-1)
+
+    @property
+    def field_radius(self) -> float:
+        """The largest √(a² + b²) in the image: of its corners, or of the edge of a fisheye lens that ends before them."""
+        w, h = self.size_px
+        corners = self.directions(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+        radius = np.linalg.norm(corners[:, :2], axis=1)
+        return float(np.where(np.isfinite(radius), radius, lens.FARTHEST).max() if self.fisheye else radius.max())
 
     def rays(self, xy_px: np.ndarray) -> np.ndarray:
         """Ray directions in the world (…, 3), scaled so that depth z_cam = 1 per unit."""
@@ -129,6 +145,8 @@ class Camera:
         return self._distort(p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]) @ self._pixel_matrix().T + self.matrix[:2, 2]  # (5)
 
     def _distort(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        if self.fisheye:
+            return np.stack([a, b], axis=-1) * lens.scale(self.distortions[:4], a, b)[0][..., None]
         k1, k2, p1, p2, k3 = self.distortions
         r2 = a * a + b * b
         L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))  # (3)
@@ -140,6 +158,9 @@ class Camera:
 
     def _distortion_derivatives(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """∂a'/∂a, ∂a'/∂b = ∂b'/∂a and ∂b'/∂b."""
+        if self.fisheye:
+            S, Q, _ = lens.scale(self.distortions[:4], a, b)
+            return S + a * a * Q, a * b * Q, S + b * b * Q
         k1, k2, p1, p2, k3 = self.distortions
         r2 = a * a + b * b
         L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -159,27 +180,37 @@ EXTERIOR = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 def interior_of(camera: Camera) -> np.ndarray:
     """The ten interior unknowns (10,) of a camera, in the order of `INTERIOR`; pixels for f, cx, cy."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    k1, k2, p1, p2, k3 = camera.distortions
+    k1, k2, p1, p2, k3 = camera.distortions[[0, 1, 3, 4, 2]] if camera.fisheye else camera.distortions
     b1 = fx * (1 + camera.affinity[0]) / fy - 1
     b2 = (fx * camera.affinity[1] + camera.matrix[0, 1]) / fy
     return np.array([fy, camera.matrix[0, 2], camera.matrix[1, 2], k1, k2, k3, p1, p2, b1, b2])
 
 
-def camera_of(name: str, size_px: tuple[int, int], interior: np.ndarray, R_cam_world: np.ndarray, t_cam_world_m: np.ndarray) -> Camera:
+def camera_of(
+    name: str, size_px: tuple[int, int], interior: np.ndarray, R_cam_world: np.ndarray, t_cam_world_m: np.ndarray, fisheye: bool = False
+) -> Camera:
     """The camera with these interior unknowns (10,) and pose."""
     f, cx, cy, k1, k2, k3, p1, p2, b1, b2 = interior
     return Camera(
         name=name,
         size_px=size_px,
         matrix=np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]),
-        distortions=np.array([k1, k2, p1, p2, k3]),
+        distortions=np.array([k1, k2, k3, p1, 0.0] if fisheye else [k1, k2, p1, p2, k3]),
+        fisheye=fisheye,
         affinity=np.array([b1, b2]),
         R_cam_world=R_cam_world,
         t_cam_world_m=t_cam_world_m,
     )
 
 
-def image_of(interior: np.ndarray, xyz_cam_m: np.ndarray) -> np.ndarray:
+Kinds = np.ndarray | bool  # (…,) which cameras have a fisheye lens
+
+
+def _fisheye_terms(interior: np.ndarray, a: np.ndarray, b: np.ndarray) -> lens.Terms:
+    return lens.scale(np.moveaxis(interior[..., [3, 4, 5, 6]], -1, 0)[..., None], a, b)
+
+
+def image_of(interior: np.ndarray, xyz_cam_m: np.ndarray, fisheye: Kinds = False) -> np.ndarray:
     """Pixels (…, M, 2) of points (…, M, 3) in the frames of cameras with interior unknowns (…, 10)."""
     f, cx, cy, k1, k2, k3, p1, p2, b1, b2 = np.moveaxis(interior, -1, 0)[..., None]
     a, b = xyz_cam_m[..., 0] / xyz_cam_m[..., 2], xyz_cam_m[..., 1] / xyz_cam_m[..., 2]
@@ -187,19 +218,26 @@ def image_of(interior: np.ndarray, xyz_cam_m: np.ndarray) -> np.ndarray:
     L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     a1 = a * L + p1 * ab2 + p2 * (r2 + 2 * a * a)
     b1_ = b * L + p1 * (r2 + 2 * b * b) + p2 * ab2
+    if np.any(fisheye):
+        S = _fisheye_terms(interior, a, b)[0]
+        a1, b1_ = (np.where(np.asarray(fisheye)[..., None], v * S, brown) for v, brown in ((a, a1), (b, b1_)))
     return np.stack([f * ((1 + b1) * a1 + b2 * b1_) + cx, f * b1_ + cy], axis=-1)
 
 
-def image_with_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def image_with_derivatives(
+    interior: np.ndarray, xyz_cam_m: np.ndarray, fisheye: Kinds = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (…, M, 2), their derivatives to the interior unknowns (…, M, 2, 10) and to the points (…, M, 2, 3), analytic.
 
     `interior` (…, 10), `xyz_cam_m` (…, M, 3) in front of the cameras (z > 0).
     """
-    image, J, G = columns_of_derivatives(interior, np.moveaxis(xyz_cam_m, -1, -2))
+    image, J, G = columns_of_derivatives(interior, np.moveaxis(xyz_cam_m, -1, -2), fisheye)
     return np.moveaxis(image, -1, -2), np.moveaxis(J, -1, -3).swapaxes(-1, -2), np.moveaxis(G, -1, -3)
 
 
-def columns_of_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def columns_of_derivatives(
+    interior: np.ndarray, xyz_cam_m: np.ndarray, fisheye: Kinds = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same with the points last, for vectorisation: from (…, 3, M) the pixels (…, 2, M), (…, 10, 2, M), (…, 2, 3, M)."""
     f, cx, cy, k1, k2, k3, p1, p2, b1, b2 = np.moveaxis(interior, -1, 0)[..., None]
     w = 1 / xyz_cam_m[..., 2, :]
@@ -209,6 +247,10 @@ def columns_of_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple
     L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     a1 = a * L + p1 * ab2 + p2 * (r2 + 2 * aa)
     b1_ = b * L + p1 * (r2 + 2 * bb) + p2 * ab2
+    curved = np.asarray(fisheye)[..., None] if np.any(fisheye) else None
+    if curved is not None:
+        S, Q, per_r = _fisheye_terms(interior, a, b)
+        a1, b1_ = np.where(curved, a * S, a1), np.where(curved, b * S, b1_)
     fs, fb = f * (1 + b1), f * b2
     x0 = (1 + b1) * a1 + b2 * b1_
     J = np.zeros((*a.shape[:-1], len(INTERIOR), 2, a.shape[-1]))
@@ -224,6 +266,14 @@ def columns_of_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple
     dL = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
     cross = a * b * dL + 2 * p1 * a + 2 * p2 * b
     da_a, db_b = L + aa * dL + 2 * p1 * b + 6 * p2 * a, L + bb * dL + 6 * p1 * b + 2 * p2 * a
+    if curved is not None:
+        t = (per_r * per_r) * r2  # θ²
+        for n, column in enumerate((3, 4, 5, 6), start=1):
+            by_k = per_r * t**n
+            x[..., column, :] = np.where(curved, (fs * a + fb * b) * by_k, x[..., column, :])
+            y[..., column, :] = np.where(curved, f * b * by_k, y[..., column, :])
+        x[..., 7, :], y[..., 7, :] = np.where(curved, 0.0, x[..., 7, :]), np.where(curved, 0.0, y[..., 7, :])
+        da_a, cross, db_b = (np.where(curved, *pair) for pair in ((S + aa * Q, da_a), (a * b * Q, cross), (S + bb * Q, db_b)))
     G = np.empty((*a.shape[:-1], 2, 3, a.shape[-1]))
     G[..., 0, 0, :], G[..., 0, 1, :] = (fs * da_a + fb * cross) * w, (fs * cross + fb * db_b) * w
     G[..., 1, 0, :], G[..., 1, 1, :] = f * cross * w, f * db_b * w

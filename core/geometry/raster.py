@@ -184,9 +184,7 @@ def _image(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _field_radius(camera: Camera) -> float:
-    width, height = camera.size_px
-    corners = camera.directions(np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]]))
-    return FIELD_MARGIN * float(np.linalg.norm(corners[:, :2], axis=1).max())
+    return FIELD_MARGIN * camera.field_radius
 
 
 def _doubled_area(xy: np.ndarray) -> np.ndarray:

@@ -96,7 +96,8 @@ def write_rig(path: Path, rig: Rig) -> None:
             f"name = {_text(camera.name)}",
             f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
             f"matrix = {_numbers(camera.matrix)}",
-            f"distortions = {_numbers(camera.distortions)}",
+            f"distortions = {_numbers(camera.distortions[:4] if camera.fisheye else camera.distortions)}",
+            *(["fisheye = true"] if camera.fisheye else []),
             f"rotation = {_numbers(vector_from_rotation(camera.R_cam_world))}",
             f"translation = {_numbers(camera.t_cam_world_m)}",
         ]
@@ -129,11 +130,13 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
     matrix = _array(entry, "matrix", (3, 3), label)
     distortions = np.zeros(5)
     given = _array(entry, "distortions", None, label) if "distortions" in entry else distortions
-    if given.ndim != 1 or len(given) > 5:
-        raise InputError(f"{label} has {given.size} distortions; this model has k1, k2, p1, p2, k3.")
+    fisheye = entry.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise InputError(f"“fisheye” of {label[0].lower() + label[1:]} must be true or false.")
+    if given.ndim != 1 or len(given) > (4 if fisheye else 5):
+        model = "a fisheye lens has k1, k2, k3, k4" if fisheye else "this model has k1, k2, p1, p2, k3"
+        raise InputError(f"{label} has {given.size} distortions; {model}.")
     distortions[: len(given)] = given
-    if entry.get("fisheye", False):
-        raise InputError(f"{label} is a fisheye camera, which is not supported; calibrate it with k1, k2, p1, p2, k3.")
     upright = matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1]
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not upright or min(size) < 8:
         raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
@@ -146,6 +149,7 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
         affinity=affinity,
         R_cam_world=rotation_from_vector(_array(entry, "rotation", (3,), label)),
         t_cam_world_m=_array(entry, "translation", (3,), label) * unit_m,
+        fisheye=fisheye,
     )
 
 

@@ -51,9 +51,7 @@ def epipolar_curve(camera: Camera, xy_px: np.ndarray, other: Camera, depth_range
     ends = _ahead(p, q, 1 / far, 1 / near)
     if ends is None:
         return np.zeros((0, 2))
-    w, h = other.size_px
-    corners = other.directions(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
-    inside = _in_disc(*ends, FIELD_MARGIN * float(np.linalg.norm(corners[:, :2], axis=1).max()))
+    inside = _in_disc(*ends, FIELD_MARGIN * other.field_radius)
     if inside is None:
         return np.zeros((0, 2))
     start, end = inside

@@ -105,6 +105,19 @@ def random_cameras(rng: np.random.Generator, kind: str) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
+def fisheye_cameras(rng: np.random.Generator, count: int = 3) -> tuple[Camera, ...]:
+    """Cameras with fisheye lenses of about 150° across, in a row close to the volume."""
+    cameras = []
+    for i in range(count):
+        centre = VOLUME_CENTRE_M + [0.6 * (i - (count - 1) / 2), rng.uniform(-0.1, 0.1), rng.uniform(-0.5, -0.4)]
+        R = _looking_at(centre, VOLUME_CENTRE_M + rng.uniform(-0.05, 0.05, 3), rng.uniform(-0.05, 0.05))
+        k = np.array([0.06, -0.02, 0.008, -0.0015]) * rng.uniform(0.5, 1.5, 4)
+        middle = (np.array(SIZE_PX) - 1) / 2 + rng.uniform(-6, 6, 2)
+        interior = np.array([300 * rng.uniform(0.95, 1.05), *middle, *k, 0, 0, 0])
+        cameras.append(camera_of("LCRABCDE"[i], SIZE_PX, interior, R, -R @ centre, fisheye=True))
+    return tuple(cameras)
+
+
 def waved_bar(
     cameras: Sequence[Camera],
     positions: int,

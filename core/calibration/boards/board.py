@@ -23,6 +23,14 @@ POINTS_PER_M = 72 / 0.0254  # of PDF
 LARGEST_PRINT_PX = 12_000
 
 
+class Lens(StrEnum):
+    """The model of the lenses."""
+
+    AUTO = "auto"
+    BROWN = "brown"
+    FISHEYE = "fisheye"
+
+
 class BoardKind(StrEnum):
     """What is printed."""
 

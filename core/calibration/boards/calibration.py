@@ -23,8 +23,9 @@ from ..delays import MovingPoints, PlacedPoints, first_delays, moving_points, pl
 from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
 from ..self_calibration import GROSS, Calibration, coarse_adjustment, robust_sigma, with_delays, without_insignificant, without_outliers
+from .board import Lens
 from .observations import BoardObservations
-from .start import FEWEST_SHARED, initial_network, without_wild
+from .start import FEWEST_SHARED, Lenses, initial_network, with_lenses
 
 DELAY_CORNERS = 8  # by which the first delays are found
 SHAPE_POSITIONS = 8  # of the board that show its shape
@@ -44,19 +45,21 @@ APART = 2.5  # times the median residual of views with positions of their own: a
 APART_SHARED = 2.0  # times that of views with shared positions, which contains the errors of the lens and of slight asynchrony
 
 
-def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
-    """Calibrate the cameras from the corners and the size of the squares alone.
+def calibrate_boards(
+    observations: BoardObservations, monitor: Monitor, focal_px: float | None = None, lens: Lens = Lens.AUTO
+) -> Calibration:
+    """Calibrate the cameras from the corners and the size of the squares alone. AUTO: each camera has the lens that fits its images.
 
     Raises:
         InputError: a camera shares too few positions of the board with the others.
     """
     monitor.step("calibration", 0, 5)
-    observations = without_wild(observations)
-    moving = moving_board(observations)
-    first, used, placed, prior = _first_adjustment(observations, moving, monitor, focal_px)
+    observations, lenses = with_lenses(observations, focal_px, lens)
+    moving = moving_board(observations, search=not lenses.fisheye.any())
+    first, used, placed, prior = _first_adjustment(observations, moving, monitor, lenses)
     if placed.moving is not None and first.network.delay_images is not None:  # again, so that no view is apart because it was late
         better = replace(placed.moving, expected_images=first.network.delay_images)
-        first, used, placed, prior = _first_adjustment(observations, better, monitor, focal_px)
+        first, used, placed, prior = _first_adjustment(observations, better, monitor, lenses)
     sigma = robust_sigma(first.residual_px, used & np.isfinite(first.residual_px).all(axis=-1))
     network, again = split_apart(first.network, placed.now(first.network), sigma)
     if len(again.frames) > len(placed.labelled.frames):
@@ -77,17 +80,17 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
 
 
 def _first_adjustment(
-    observations: BoardObservations, moving: MovingPoints | None, monitor: Monitor, focal_px: float | None
+    observations: BoardObservations, moving: MovingPoints | None, monitor: Monitor, lenses: Lenses
 ) -> "tuple[Adjusted[BoardNetwork], np.ndarray, _Placed, Unknowns]":
     """A robust adjustment from nothing: the network, the image points used, the positions, and the prior with delays if they matter."""
     if moving is not None and moving.expected_images.any():
         observations = observations.changed(moving.at(moving.expected_images)[0])
-    started = initial_network(observations, focal_px)
+    started = initial_network(observations, lenses)
     monitor.step("calibration", 1, 5)
     network, sigma = _refined(started.network, started.observations, monitor)
     network, labelled = split_apart(network, started.observations, sigma)
     monitor.step("calibration", 2, 5)
-    prior = lens_prior(labelled.size_px, network.interior[:, 0])
+    prior = lens_prior(labelled.size_px, network.interior[:, 0], network.fisheye)
     network, used = with_boards(network, labelled, max(10 * sigma, 1.0))
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     placed = _Placed(labelled=labelled, moving=moving)
@@ -125,8 +128,8 @@ class _Placed:
         return with_boards(network, self.now(network), tolerance_px)
 
 
-def moving_board(observations: BoardObservations) -> MovingPoints | None:
-    """The paths of the corners, and how late each camera is, roughly; None for images that do not follow one another.
+def moving_board(observations: BoardObservations, search: bool = True) -> MovingPoints | None:
+    """The paths of the corners, and how late each camera is, roughly, if that is searched; None for images that do not follow one another.
 
     The corners of a board that looks the same from both ends have no paths: their order may differ from image to image.
     """
@@ -135,6 +138,8 @@ def moving_board(observations: BoardObservations) -> MovingPoints | None:
     moving = moving_points(observations.frames, observations.xy_px)
     if not np.isfinite(moving.coefficients[1]).any():
         return None
+    if not search:  # it needs lenses that keep lines nearly straight
+        return moving
     often = observations.visible.sum(axis=(0, 1))
     usual = np.flatnonzero(often >= np.median(often))
     some = usual[np.unique(np.linspace(0, len(usual) - 1, DELAY_CORNERS).astype(int))]
@@ -278,7 +283,7 @@ def _corners(network: BoardNetwork, residual_px: np.ndarray, used: np.ndarray, p
     for c, (interior, R, t) in enumerate(zip(network.interior, network.R, network.t)):
         p = X @ R.T + t
         shown = used[:, c] & (p[..., 2] > NEAREST_M)
-        _, _, G = image_with_derivatives(interior, np.where(shown[..., None], p, [0.0, 0.0, 1.0]))
+        _, _, G = image_with_derivatives(interior, np.where(shown[..., None], p, [0.0, 0.0, 1.0]), network.curved[c])
         J = np.where(shown[..., None, None], G @ R @ network.R_board[:, None], 0.0)
         v = np.where(shown[..., None], residual_px[:, c], 0.0)
         N += np.einsum("nkai,nkaj->kij", J, J)
@@ -310,7 +315,7 @@ def _apart(labelled: BoardObservations) -> np.ndarray:
 
 def _refined(network: BoardNetwork, observations: BoardObservations, monitor: Monitor) -> tuple[BoardNetwork, float]:
     """Robust adjustment with more and more unknowns; sigma [px]."""
-    prior = lens_prior(observations.size_px, network.interior[:, 0])
+    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
     cauchy, sigma = COARSE_CAUCHY_PX, 1.0
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR):
         monitor.step("calibration", 1, 5)

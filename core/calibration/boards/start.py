@@ -20,11 +20,17 @@ from ..bars import undistorted
 from ..bundle import LevenbergMarquardt, adjust
 from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, FOCAL_GRID, KAPPAS, ROUGH_FOCALS, lens_prior
+from .board import Lens
 from .detection import FEWEST_CORNERS
 from .observations import BoardObservations
 
 GRID_POSITIONS = 24  # from which the lens of a camera is found
 LENS_POSITIONS = 60  # with which it is adjusted
+WILD_FISHEYE = 0.6  # the same for a fisheye lens, whose images of a plane are bent
+FISHEYE_GRID = np.geomspace(0.2, 1.0, 14)  # focal lengths in widths
+WIDE_ANGLE = 0.75  # widths: a camera with a shorter focal length may have a fisheye lens
+CLEAR = 20.0  # 2 n ln(cost / cost): the lens that fits n image points better is clear
+WIDEST = 1.5  # radians from the axis
 WILD = 0.25  # of a square's side: corners that are further from the homography of their view are not used
 PROPOSALS = 40  # positions that propose the relative pose of a pair
 JUDGES = 80  # positions that judge the proposals
@@ -41,14 +47,14 @@ class Started:
     observations: BoardObservations
 
 
-def without_wild(observations: BoardObservations) -> BoardObservations:
+def without_wild(observations: BoardObservations, wild: float = WILD) -> BoardObservations:
     """The observations without corners that do not fit the homography of their view, and without views with too few corners."""
     xy = observations.xy_px.copy()
     plane = observations.board.corners_m[:, :2]
     for i, c in np.argwhere(observations.views(observations.visible)):
         shown = np.isfinite(xy[i, c, :, 0])
         F, fits = cv2.findHomography(
-            plane[shown] / observations.board.square_m, xy[i, c, shown], cv2.RANSAC, _tolerance_px(xy[i, c], observations)
+            plane[shown] / observations.board.square_m, xy[i, c, shown], cv2.RANSAC, _tolerance_px(xy[i, c], observations, wild)
         )
         keep = np.zeros(len(plane), dtype=bool)
         if F is not None:
@@ -58,24 +64,58 @@ def without_wild(observations: BoardObservations) -> BoardObservations:
     return observations.changed(np.where(observations.supported(visible)[..., None], xy, np.nan))
 
 
-def _tolerance_px(xy_px: np.ndarray, observations: BoardObservations) -> float:
+def _tolerance_px(xy_px: np.ndarray, observations: BoardObservations, wild: float) -> float:
     columns, rows = observations.board.grid
     grid = xy_px.reshape(rows, columns, 2)
     sides = np.concatenate([np.linalg.norm(np.diff(grid, axis=a), axis=-1).ravel() for a in (0, 1)])
     sides = sides[np.isfinite(sides)]
-    return max(1.0, WILD * float(np.median(sides))) if len(sides) else 1.0
+    return max(1.0, wild * float(np.median(sides))) if len(sides) else 1.0
 
 
-def initial_network(observations: BoardObservations, focal_px: float | None = None) -> Started:
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Lenses:
+    """The first values of the lenses."""
+
+    interior: np.ndarray  # (C, 10)
+    fisheye: np.ndarray  # (C,)
+
+
+def with_lenses(observations: BoardObservations, focal_px: float | None, lens: Lens) -> tuple[BoardObservations, Lenses]:
+    """The observations without wild corners, and the lens of each camera from its own images.
+
+    A wide-angle camera has the model that fits its images better; which views of a board a homography fits depends on it.
+    """
+    plain = without_wild(observations, WILD_FISHEYE if lens is Lens.FISHEYE else WILD)
+    every = [plain.of_camera(c) for c in range(len(observations.names))]
+    if lens is not Lens.AUTO:
+        curved = lens is Lens.FISHEYE
+        interior = np.stack([_lens(part, focal_px, curved)[0] for part in every])
+        return plain, Lenses(interior=interior, fisheye=np.full(len(every), curved))
+    lenses = _fitting(every, focal_px)
+    return without_wild(observations, WILD_FISHEYE) if lenses.fisheye.any() else plain, lenses
+
+
+def _fitting(every: list[BoardObservations], focal_px: float | None) -> Lenses:
+    """The lens of each camera that fits its images better; where this is not clear, that of the other wide-angle cameras."""
+    brown = [_lens(one, focal_px, False) for one in every]
+    wide = [interior[0] < WIDE_ANGLE * one.size_px[0, 0] for (interior, _), one in zip(brown, every)]
+    both = [[_lens(one, focal_px, curved, True) for curved in (False, True)] if w else [] for one, w in zip(every, wide)]
+    better = np.array([2 * one.visible.sum() * np.log(b[0][1] / b[1][1]) if b else 0.0 for one, b in zip(every, both)])
+    fisheye = np.array(wide) & np.where(np.abs(better) > CLEAR, better > 0, better.sum() > CLEAR)
+    interior = [b[1][0] if curved else first for b, curved, (first, _) in zip(both, fisheye, brown)]
+    return Lenses(interior=np.stack(interior), fisheye=fisheye)
+
+
+def initial_network(observations: BoardObservations, lenses: Lenses) -> Started:
     """Lenses, poses and positions.
 
     Raises:
         InputError: a camera never shows the board, or shares too few positions with the others.
     """
-    interior = np.stack([_lens(observations.of_camera(c), focal_px) for c in range(len(observations.names))])
+    interior = lenses.interior
     identity = np.zeros((len(interior), 3, 3)) + np.eye(3)
     rough = BoardNetwork(
-        interior=interior, R=identity, t=np.zeros((len(interior), 3)), corners_m=observations.board.corners_m,
+        interior=interior, R=identity, t=np.zeros((len(interior), 3)), fisheye=lenses.fisheye, corners_m=observations.board.corners_m,
         R_board=np.zeros((0, 3, 3)), t_board=np.zeros((0, 3)),
     )  # fmt: skip
     cameras = rough.cameras(observations.names, observations.size_px)
@@ -84,35 +124,44 @@ def initial_network(observations: BoardObservations, focal_px: float | None = No
     return _positions(observations, replace(rough, R=R, t=t), plane)
 
 
-def _lens(one: BoardObservations, focal_px: float | None) -> np.ndarray:
-    """The interior unknowns (10,) of a camera from its own images."""
+def _lens(one: BoardObservations, focal_px: float | None, fisheye: bool, whole: bool = False) -> tuple[np.ndarray, float]:
+    """The interior unknowns (10,) of a camera from its own images, and the cost of the robust adjustment per image point."""
     width, height = one.size_px[0]
     some = one.part(_spread(one, GRID_POSITIONS))
-    grid = focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_GRID * float(width)
+    grid = focal_px * ROUGH_FOCALS if focal_px is not None else (FISHEYE_GRID if fisheye else FOCAL_GRID) * float(width)
     best = (np.inf, float(np.median(grid)), 0.0)
-    for kappa in KAPPAS:
+    for kappa in (0.0,) if fisheye else KAPPAS:
         u = undistorted(some.xy_px[:, 0], one.size_px[0], kappa)
         for f in grid:
-            cost = sum(_ippe(one.board.corners_m, x / f)[0][2] * f for x in u)
+            images = _flat(u / f) if fisheye else u / f
+            cost = sum(_ippe(one.board.corners_m, x)[0][2] * f for x in images)
             best = min(best, (float(cost), float(f), kappa))
     interior = np.zeros(len(INTERIOR))
     interior[:4] = best[1], (width - 1) / 2, (height - 1) / 2, best[2] / (float(one.size_px[0] @ one.size_px[0]) / 4 / best[1] ** 2)
     more = one.part(_spread(one, LENS_POSITIONS))
-    network = _single(more, interior)
-    prior = lens_prior(more.size_px, network.interior[:, 0])
-    for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2")):
+    network = _single(more, interior, fisheye)
+    prior = lens_prior(more.size_px, network.interior[:, 0], network.fisheye)
+    cost = np.inf
+    for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2"), ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2"))[: 3 if whole else 2]:
         done = adjust(
             network, more.xy_px, more.visible, prior.only(*names), cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3,
             iteration=LevenbergMarquardt(max_iterations=12, tolerance=1e-2),
         )  # fmt: skip
-        network = done.network
-    return np.asarray(network.interior[0])
+        network, cost = done.network, done.cost
+    return np.asarray(network.interior[0]), cost / max(int(more.visible.sum()), 1)
 
 
-def _single(one: BoardObservations, interior: np.ndarray) -> BoardNetwork:
+def _flat(angles: np.ndarray) -> np.ndarray:
+    """Image points (…, 2) of a central projection with focal length 1, from those of an equidistant lens, θ = r."""
+    theta = np.linalg.norm(angles, axis=-1, keepdims=True)
+    near = np.minimum(theta, WIDEST)
+    return np.asarray(angles * np.where(theta > 1e-9, np.tan(near) / np.maximum(theta, 1e-9), 1.0))
+
+
+def _single(one: BoardObservations, interior: np.ndarray, fisheye: bool) -> BoardNetwork:
     """One camera at the origin with its positions of the board."""
     network = BoardNetwork(
-        interior=interior[None], R=np.eye(3)[None], t=np.zeros((1, 3)), corners_m=one.board.corners_m,
+        interior=interior[None], R=np.eye(3)[None], t=np.zeros((1, 3)), fisheye=np.array([fisheye]), corners_m=one.board.corners_m,
         R_board=np.zeros((0, 3, 3)), t_board=np.zeros((0, 3)),
     )  # fmt: skip
     camera = network.cameras(one.names, one.size_px)[0]
@@ -185,13 +234,20 @@ def _misses(
     """Median distance (…,) of the corners of boards with poses R (…, 3, 3), t (…, 3) from an image (…, K, 2), and the order that fits."""
     X = corners_m @ np.swapaxes(R, -1, -2) + t[..., None, :]
     ahead = X[..., 2:] > 0
-    x = np.where(ahead, X[..., :2] / np.where(ahead, X[..., 2:], 1.0), 1e3)
+    x = _angles(np.where(ahead, X[..., :2] / np.where(ahead, X[..., 2:], 1.0), 1e3))
+    image = _angles(image)
     with np.errstate(invalid="ignore"):
         every = np.stack([np.linalg.norm(x - image[..., order, :], axis=-1) for order in symmetries])
     every = np.where(np.isfinite(every), every, np.nan)
     few = np.isfinite(every).sum(axis=-1) < FEWEST_CORNERS
     middle = np.where(few, np.inf, np.nanmedian(np.where(few[..., None], 0.0, every), axis=-1))
     return middle.min(axis=0), middle.argmin(axis=0)
+
+
+def _angles(x: np.ndarray) -> np.ndarray:
+    """Points (…, 2) of a central projection with their distance from the axis as an angle, bounded at the edge of wide lenses."""
+    r = np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.asarray(x * np.arctan(r) / np.maximum(r, 1e-12))
 
 
 def _pair(observations: BoardObservations, plane: PlanePoses, i: int, j: int) -> tuple[int, float, np.ndarray, np.ndarray]:

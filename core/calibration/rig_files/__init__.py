@@ -18,6 +18,7 @@ FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "openptv": openptv.write,
     "pose2sim": toml_files.write_pose2sim,
 }
+WITH_FISHEYE = ("anipose", "pose2sim", "caliscope")  # that can hold OpenCV's fisheye lens
 FOLDERS = ("colmap", "easymocap", "openptv")  # written as several files into a folder
 
 
@@ -65,4 +66,7 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
         raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
     if name in FOLDERS and Path(path).is_file():
         raise InputError(f"{path} is a file; {name} needs a folder.")
+    curved = [camera.name for camera in rig.cameras if camera.fisheye]
+    if curved and name not in WITH_FISHEYE:
+        raise InputError(f"{name} has no fisheye lens, as camera {curved[0]} has; choose one of {', '.join(WITH_FISHEYE)}.")
     return FORMATS[name](Path(path), rig)

@@ -74,6 +74,7 @@ def make_camera(
     R_cam_world: np.ndarray,
     t_cam_world_m: np.ndarray,
     affinity: np.ndarray | None = None,
+    fisheye: bool = False,
 ) -> Camera:
     """A camera, checked.
 
@@ -92,6 +93,7 @@ def make_camera(
         affinity=np.zeros(2) if affinity is None else affinity,
         R_cam_world=R_cam_world,
         t_cam_world_m=t_cam_world_m,
+        fisheye=fisheye,
     )
 
 
@@ -142,6 +144,8 @@ def plain(camera: Camera, k3: bool = True) -> Camera:
         matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
         return replace(simple, matrix=matrix, distortions=d, R_cam_world=np.eye(3), t_cam_world_m=np.zeros(3))
 
+    if camera.fisheye and not shear:
+        return simple
     start = np.array([fx, fy, cx, cy, *camera.distortions[: 5 if k3 else 4]])
     scale = np.array([1.0, 1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-5, 1e-5, 1e-3])[: len(start)]
     p, turn, _ = fitted(camera, lambda p, rays: with_parameters(p).project(rays), start, scale)

@@ -50,8 +50,10 @@ def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camer
     missing = [k for k in ("size", "rotation", "translation") if k not in entry]
     if missing:
         raise InputError(f"Camera “{name}” in {path} lacks “{missing[0]}”; choose the file of the finished rig.")
-    if entry.get("fisheye"):
-        raise InputError(f"Camera “{name}” in {path} is a fisheye camera, which is not supported; calibrate it with k1, k2, p1, p2, k3.")
+    fisheye = entry.get("fisheye") is True
+    given = numbers(entry.get("distortions", []), (-1,), f"“distortions” {label}")
+    if fisheye and np.any(given[4:]):
+        raise InputError(f"Camera “{name}” in {path} has a fisheye lens with more than k1, k2, k3, k4; calibrate it again.")
     rotation = np.asarray(entry["rotation"], dtype=object)
     R = numbers(entry["rotation"], (3, 3), f"“rotation” {label}") if rotation.shape == (3, 3) else None
     affinity = numbers(entry["affinity"], (2,), f"“affinity” {label}") if "affinity" in entry else None
@@ -63,19 +65,20 @@ def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camer
         rotation_from_vector(numbers(entry["rotation"], (3,), f"“rotation” {label}")) if R is None else R,
         numbers(entry["translation"], (3,), f"“translation” {label}") * unit_m,
         affinity,
+        fisheye,
     )
 
 
 def write_anipose(path: Path, rig: Rig) -> list[Path]:
     """Write as aniposelib does, in metres, cameras without affinity."""
-    parts = [_table(f"cam_{n}", plain(camera), 5, ()) for n, camera in enumerate(rig.cameras)]
+    parts = [_table(f"cam_{n}", plain(camera), 5, ("fisheye = true",) if camera.fisheye else ()) for n, camera in enumerate(rig.cameras)]
     store.write_text(path, "\n".join([*parts, "[metadata]\nadjusted = true\nerror = 0.0\n"]))
     return [path]
 
 
 def write_pose2sim(path: Path, rig: Rig) -> list[Path]:
     """Write as Pose2Sim does: a table per camera's name, four distortions, metres; k3 is fitted into the others."""
-    parts = [_table(_key(camera.name), plain(camera, k3=False), 4, ("fisheye = false",)) for camera in rig.cameras]
+    parts = [_table(_key(camera.name), plain(camera, k3=False), 4, (_fisheye(camera),)) for camera in rig.cameras]
     store.write_text(path, "\n".join([*parts, "[metadata]\nadjusted = false\nerror = 0.0\n"]))
     return [path]
 
@@ -84,7 +87,7 @@ def write_caliscope(path: Path, rig: Rig) -> list[Path]:
     """Write caliscope's camera_array.toml: cameras numbered from 0, metres."""
     parts = []
     for n, camera in enumerate(rig.cameras):
-        extra = (f"cam_id = {n}", "rotation_count = 0", "fisheye = false")
+        extra = (f"cam_id = {n}", "rotation_count = 0", _fisheye(camera))
         parts.append(_table(f"cameras.{n}", plain(camera), 5, extra))
     store.write_text(path, "\n".join(parts))
     return [path]
@@ -96,12 +99,16 @@ def _table(key: str, camera: Camera, distortions: int, extra: tuple[str, ...]) -
         f"name = {_quoted(camera.name)}",
         f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
         f"matrix = {camera.matrix.tolist()!r}",
-        f"distortions = {camera.distortions[:distortions].tolist()!r}",
+        f"distortions = {camera.distortions[: 4 if camera.fisheye else distortions].tolist()!r}",
         f"rotation = {vector_from_rotation(camera.R_cam_world).tolist()!r}",
         f"translation = {camera.t_cam_world_m.tolist()!r}",
         *extra,
     ]
     return "\n".join(lines) + "\n"
+
+
+def _fisheye(camera: Camera) -> str:
+    return f"fisheye = {str(camera.fisheye).lower()}"
 
 
 def _key(name: str) -> str:

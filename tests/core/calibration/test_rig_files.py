@@ -112,9 +112,19 @@ def test_anipose_file(tmp_path: Path) -> None:
     D = np.array([-0.12, 0.03, 0.001, -0.002, 0.004])
     expected, _ = cv2.projectPoints(points * 1000, np.array([0.1, -0.2, 0.3]), np.array([100.0, -200.0, 1500.0]), K, D)
     assert np.abs(rig["A"].project(points) - expected[:, 0]).max() < 1e-6
-    path.write_text(ANIPOSE.replace("[cam_1]", "fisheye = true\n\n[cam_1]"))
-    with pytest.raises(InputError, match="fisheye"):
+    five = ANIPOSE.replace("[cam_1]", "fisheye = true\n\n[cam_1]")
+    path.write_text(five)
+    with pytest.raises(InputError, match="more than k1, k2, k3, k4"):
         read_any(path)
+    path.write_text(five.replace(" 0.004,]", "]", 1))
+    curved = read_any(path)
+    assert curved["A"].fisheye and curved["A"].distortions.tolist() == [-0.12, 0.03, 0.001, -0.002, 0.0]
+    with pytest.raises(InputError, match="opencv has no fisheye lens, as camera A has; choose one of anipose"):
+        write_as(tmp_path / "a.yml", curved, "opencv")
+    for kind in ("anipose", "caliscope"):
+        write_as(tmp_path / "again.toml", curved, kind)
+        again = read_any(tmp_path / "again.toml").cameras[0]
+        assert again.fisheye and again.distortions.tolist() == curved["A"].distortions.tolist()
 
 
 def test_pose2sim_file(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.camera import INTERIOR, Camera, camera_of, image_of, image_with_derivatives, interior_of
 from tricap.core.geometry.rotation import rotation_from_vector
 
 STRONG = [-0.30, 0.12, 1.2e-3, -0.8e-3, -0.02]
@@ -117,3 +117,57 @@ def test_arrays_are_checked_and_cannot_be_changed() -> None:
         values = dict(name="C", size_px=(8, 8), matrix=np.eye(3)) | wrong
         with pytest.raises(ValueError, match="has shape"):
             Camera(**values)  # type: ignore[arg-type]
+
+
+WIDE = [0.08, -0.03, 0.012, -0.002, 0.0]
+
+
+def fisheye(affinity: tuple[float, float] = (0.0, 0.0)) -> Camera:
+    """150° across."""
+    matrix = np.array([[300.0, 0, 381.0], [0, 300.0, 290.0], [0, 0, 1]])
+    R = rotation_from_vector(np.array([0.1, -0.2, 0.3]))
+    return Camera(name="a", size_px=(768, 576), matrix=matrix, distortions=np.array(WIDE), affinity=np.array(affinity),
+                  R_cam_world=R, t_cam_world_m=np.array([0.1, 0.2, 0.3]), fisheye=True)  # fmt: skip
+
+
+def in_view(c: Camera, widest_deg: float = 84.0) -> np.ndarray:
+    """Points (300, 3) in the world up to an angle from the axis, one of them on it."""
+    rng = np.random.default_rng(1)
+    angle, turn, far = np.radians(rng.uniform(0, widest_deg, 300)), rng.uniform(0, 2 * np.pi, 300), rng.uniform(0.5, 5, (300, 1))
+    angle[0] = 0.0
+    p = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1) * far
+    return np.asarray((p - c.t_cam_world_m) @ c.R_cam_world)
+
+
+def test_a_fisheye_lens_is_that_of_opencv() -> None:
+    c = fisheye()
+    X = in_view(c)
+    theirs, _ = cv2.fisheye.projectPoints(X[:, None], cv2.Rodrigues(c.R_cam_world)[0], c.t_cam_world_m, c.matrix, c.distortions[:4])
+    assert np.abs(c.project(X) - theirs[:, 0]).max() < 1e-9
+
+
+def test_a_fisheye_lens_has_its_inverse_and_derivatives() -> None:
+    c = fisheye((0.01, -0.005))
+    X = in_view(c)
+    image, jacobian = c.project_with_jacobian(X)
+    again = c.project(c.points_at_depth(image, c.to_camera(X)[:, 2]))
+    assert np.abs(again - image).max() < 1e-8
+    steps = [(c.project(X + h) - c.project(X - h)) / 2e-6 for h in 1e-6 * np.eye(3)]
+    assert np.abs(np.stack(steps, axis=-1) - jacobian).max() < 1e-4 * np.abs(jacobian).max()
+    interior, p = interior_of(c), c.to_camera(X)
+    image, J, G = image_with_derivatives(interior, p, True)
+    assert np.abs(image - c.project(X)).max() < 1e-9 and np.abs(G @ c.R_cam_world - jacobian).max() < 1e-8
+    for n, step in enumerate(1e-6 * np.diag([300, 300, 300, 1, 1, 1, 1, 1, 1, 1])):
+        difference = (image_of(interior + step, p, True) - image_of(interior - step, p, True)) / (2 * step[n])
+        assert np.abs(difference - J[..., n]).max() < 1e-5 * max(1.0, np.abs(J[..., n]).max()), INTERIOR[n]
+    both = np.stack([interior, interior])
+    mixed = image_of(both, np.stack([p, p]), np.array([True, False]))
+    assert np.array_equal(mixed[0], image_of(interior, p, True)) and np.array_equal(mixed[1], image_of(interior, p))
+    rebuilt = camera_of("a", c.size_px, interior, c.R_cam_world, c.t_cam_world_m, fisheye=True)
+    assert np.abs(rebuilt.project(X) - c.project(X)).max() < 1e-9
+
+
+def test_a_fisheye_lens_ends_before_ninety_degrees() -> None:
+    c = fisheye()
+    assert np.isnan(c.directions(np.array([[3000.0, 290.0]]))[0, 0]) and np.isfinite(c.directions(np.array([[381.0, 290.0]]))).all()
+    assert np.isfinite(c.resized((384, 288)).field_radius) and c.field_radius > 3

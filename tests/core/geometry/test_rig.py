@@ -99,7 +99,7 @@ FAULTS = {
     "transposed matrix": (text({"matrix": "[[1500.0, 0, 0], [0, 1500.0, 0], [380.0, 290.0, 1.0]]"}), "impossible matrix"),
     "tiny size": (text({"size": "[4, 576]"}), "impossible matrix or size"),
     "too many distortions": (text({"distortions": "[0, 0, 0, 0, 0, 0, 0, 0]"}), "has 8 distortions"),
-    "fisheye": (text({"fisheye": "true"}), "fisheye camera, which is not supported"),
+    "fisheye": (text({"fisheye": '"yes"'}), "must be true or false"),
 }
 
 
@@ -129,3 +129,14 @@ def test_sigmas_are_kept_and_checked(tmp_path: Path) -> None:
     for wrong in ("3", "{ f = nan }", "{ f = -1.0 }", '{ f = "1" }'):
         with pytest.raises(InputError, match="“sigma” of camera “L”"):
             read(tmp_path, text({"sigma": wrong}))
+
+
+def test_a_fisheye_camera_is_written_as_anipose_writes_it(tmp_path: Path) -> None:
+    given = text({"distortions": "[0.08, -0.03, 0.01, -0.002]"}).replace("size =", "fisheye = true\nsize =", 1)
+    camera = read(tmp_path, given).cameras[0]
+    assert camera.fisheye and camera.distortions.tolist() == [0.08, -0.03, 0.01, -0.002, 0.0]
+    write_rig(tmp_path / "b.toml", Rig(cameras=(camera,)))
+    again = read_rig(tmp_path / "b.toml").cameras[0]
+    assert again.fisheye and again.distortions.tolist() == camera.distortions.tolist()
+    with pytest.raises(InputError, match="a fisheye lens has k1, k2, k3, k4"):
+        read(tmp_path, given.replace("-0.002]", "-0.002, 0.1]"))
