@@ -294,6 +294,7 @@ def show_views(
         view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
         view.fps, view.drift_ppm, view.timestamps = entry.get("fps", 0.0), entry.get("drift_ppm", 0.0), entry.get("timestamps", "")
+        view.readout_s = entry.get("readout", 0.0)
         view.start_s, view.offset_frames = entry.get("start", 0.0), entry.get("offset_frames", 0)
         view.person = next((key for key in PERSON_SOURCES if key in entry), "")
         view.person_files = entry.get(view.person, "")
@@ -340,6 +341,7 @@ def view_entry(view: Any) -> Table:
     entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
     entry |= {"fps": properties.exact(view.fps), "start": properties.exact(view.start_s)}
     entry |= {"drift_ppm": properties.exact(view.drift_ppm), "timestamps": view.timestamps}
+    entry |= {"readout": properties.exact(view.readout_s)}
     if view.person:
         entry[view.person] = view.person_files
     return {key: value for key, value in entry.items() if value or key == "name"}

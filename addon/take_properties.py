@@ -83,6 +83,14 @@ class View(bpy.types.PropertyGroup):
         update=_shifted,  # type: ignore[valid-type]
         description="When this camera took its first image, in seconds after the beginning of the take; Synchronise finds it",
     )
+    readout_s: bpy.props.FloatProperty(
+        name="Readout",
+        precision=4,
+        min=-1.0,
+        max=1.0,
+        update=notify_change,  # type: ignore[valid-type]
+        description="Rolling shutter: seconds from the first row of an image to the last, such as 0.016. 0: all rows at once",
+    )
     drift_ppm: bpy.props.FloatProperty(name="Drift", options={"HIDDEN"})  # type: ignore[valid-type]
     timestamps: bpy.props.StringProperty(name="Time Stamps", options={"HIDDEN"})  # type: ignore[valid-type]
 

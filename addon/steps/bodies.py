@@ -59,6 +59,7 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
         pair = layout.column(align=True)
         pair.prop(props.views[props.view_index], "fps")
         pair.prop(props.views[props.view_index], "start_s")
+        pair.prop(props.views[props.view_index], "readout_s")
     if len(props.views) > 1:
         layout.operator("tricap.synchronise", icon="TIME")
     draw_person(layout, context)

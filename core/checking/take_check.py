@@ -414,7 +414,8 @@ def rolling_finding(offset: TimeOffset) -> Finding:
         Cause.ROLLING_SHUTTER,
         f"The rolling shutter of view {offset.view} takes {abs(r):.2f} ± {offset.readout_sigma:.2g} frames {word} from first to last "
         f"row than that of the reference view; the rays of moving points there miss by up to {offset.rolling_px:.1f} px.",
-        "Use a mode that reads the sensor faster, or cameras of one kind, held level; keep fast movements at middle height.",
+        "Give the `readout` of the views in take.toml, in seconds from the first row to the last (only the difference is measured here), "
+        "use a mode that reads the sensor faster, or cameras of one kind, held level.",
         readout_frames=r,
         readout_sigma_frames=offset.readout_sigma,
     )

@@ -15,9 +15,9 @@ Where no moving points can be tracked, (1) alone may give whole frames: for view
 has another rhythm from another side, and only where L correlates better than 0 by several sigmas (5). One rise and fall of the energy is
 one sample, however many frames it takes (Bartlett 1946, doi:10.2307/2983611).
 
-A rolling shutter exposes one row after the other: r in (4) is by how many frames the readout of view k, from the first row to the last,
-takes longer than that of the view it is compared with. Between cameras of one kind that see a point in the same row, r has no effect and
-does no harm.
+A rolling shutter exposes one row after the other. Where take.toml has the readout, s starts from it for every point, too; r in (4) is by how
+many frames the readout of view k, from the first row to the last, takes longer beyond that than that of the view it is compared with. Between
+cameras of one kind that see a point in the same row, r has no effect and does no harm.
 """
 
 from dataclasses import dataclass, replace
@@ -306,8 +306,20 @@ def _track_matches(film: Film, base: int, k: int, frame: int, lag: int) -> _Trac
     y = xb[:, 1] / cb.size_px[1] - 0.5
     predicted = film.footage.delay(base, frame) * film.footage.interval_frames(base) / film.footage.interval_frames(k)
     predicted -= film.footage.delay(k, frame)
-    distances = np.stack([*(epipolar_distance_px(ca, cb, xa, film.rows.to_frame(at[good])) for at in xy), y, predicted + 0 * y], axis=1)
+    ya = xa[:, 1] / ca.size_px[1] - 0.5
+    rolled = (_readout_s(film.footage, base) * ya - _readout_s(film.footage, k) * y) / _period_s(film.footage, k)
+    distances = np.stack([*(epipolar_distance_px(ca, cb, xa, film.rows.to_frame(at[good])) for at in xy), y, predicted + rolled], axis=1)
     return _Tracked(matches=PairMatches(i=base, j=k, xi_px=xa, xj_px=xb), distances=distances)
+
+
+def _readout_s(footage: Footage, view: int) -> float:
+    """The known readout of a view."""
+    return footage.clocks[view].readout_s if footage.clocks else 0.0
+
+
+def _period_s(footage: Footage, view: int) -> float:
+    """The time between two images of a view."""
+    return footage.interval_frames(view) / footage.take.fps
 
 
 def _flow(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray:

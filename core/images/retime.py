@@ -33,8 +33,10 @@ class TimingSettings:
     )
 
 
-def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, delay_frames: float) -> np.ndarray:
-    """The image (h, w) float32 as it was `delay_frames` earlier; `before` and `after` are its neighbours in time.  (1)"""
+def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, delay_frames: float | np.ndarray) -> np.ndarray:
+    """The image (h, w) float32 as it was `delay_frames` earlier, all of it or each of its rows (h,), which a rolling shutter exposes one
+    after another; `before` and `after` are its neighbours in time.  (1)"""
+    delay_frames = np.asarray(delay_frames, dtype=np.float32).reshape(-1, 1, 1)
     forward, back = (None if other is None else _flow(grey, other) for other in (after, before))
     if forward is None or back is None:
         only = forward if forward is not None else -back if back is not None else np.zeros((*grey.shape, 2), np.float32)

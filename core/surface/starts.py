@@ -189,7 +189,8 @@ def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
 
     rows = [grid.rows(image) for image in footage.read(frame)]
     for k in range(len(rows)):
-        if late := footage.delay(k, frame):
+        late = footage.row_delays(k, frame, len(rows[k]))
+        if late.any():
             number = footage.number(k, frame)
             rows[k] = retimed(rows[k], image(k, number - 1), image(k, number + 1), late)
     return rows

@@ -158,7 +158,9 @@ class _Lights:
             sequence = open_sequence(self._take.folder, images=view.images, movie=view.movie, view=view.name)
             timed = replace(self._take, views=(replace(view, fps=view.fps or _rate(self._take)),))
             brightness = brightness_of(sequence, self._take.rows_at(0), monitor)
-            self._found[view.name] = light_changes(brightness), clocks_of(timed, (sequence,))[0]
+            clock = clocks_of(timed, (sequence,))[0]
+            known = abs(clock.readout_s / clock.period_s) if clock.readout_s else None
+            self._found[view.name] = light_changes(brightness[:, ::-1] if clock.readout_s < 0 else brightness, known), clock
         return self._found[view.name]
 
 

@@ -3,7 +3,9 @@
     T_n = start − offset_frames / fps + (1 + drift) τ_n ,   τ_n = n / fps, or the time stamp of image n minus that of image 0        (1)
 
 Frame t of the take is at the instant t / (fps of the take). A view shows it by the image that was exposed nearest to that instant, and the
-measured images are interpolated over the rest (`images.retime`).
+measured images are interpolated over the rest (`images.retime`). A rolling shutter exposes the row at height y, 0 … 1, at
+
+    T_n + readout (y − ½)                                                                                                       (2)
 """
 
 import csv
@@ -24,9 +26,10 @@ if TYPE_CHECKING:
     from ..images.sequence import ImageSequence
     from .take import Take, View
 
-KEYS = ("fps", "start", "drift_ppm", "timestamps")  # of [[views]]
+KEYS = ("fps", "start", "drift_ppm", "timestamps", "readout")  # of [[views]]
 LONGEST_S = 1e6  # between the starts of two views
 MOST_DRIFT_PPM = 1e4
+LONGEST_READOUT_S = 1.0
 VIEW_COLUMNS = ("view", "cam_id", "camera", "cam")  # of a file with the time stamps of several views
 TIME_COLUMNS = ("time_s", "frame_time", "timestamp", "time")
 ORDER_COLUMN = "frame_index"
@@ -43,6 +46,7 @@ class Clock:
     start_s: float
     period_s: float
     times_s: np.ndarray | None = None
+    readout_s: float = 0.0  # of a rolling shutter, from the first row to the last; negative where the last row is the first
 
     def __post_init__(self) -> None:
         if self.times_s is not None:
@@ -73,9 +77,14 @@ class Clock:
         delay = late / abs(self.time_s(number) - self.time_s(number - 1 if late > 0 else number + 1))
         return round(delay, 4) if abs(delay) >= LEAST_DELAY else 0.0
 
-    def digest(self) -> tuple[float, float, bytes]:
+    def row_delays(self, rows: int) -> np.ndarray:
+        """By how many of its intervals each of the rows of an image was exposed after its middle one (rows,).  (2)"""
+        return self.readout_s / self.period_s * ((np.arange(rows) + 0.5) / rows - 0.5)
+
+    def digest(self) -> tuple[float | bytes, ...]:
         """The content, as values with a `repr`."""
-        return self.start_s, self.period_s, b"" if self.times_s is None else self.times_s.tobytes()
+        times = b"" if self.times_s is None else self.times_s.tobytes()
+        return (self.start_s, self.period_s, times, *((self.readout_s,) if self.readout_s else ()))
 
 
 def view_clock(entry: Mapping[str, Any], label: str) -> dict[str, Any]:
@@ -91,10 +100,14 @@ def view_clock(entry: Mapping[str, Any], label: str) -> dict[str, Any]:
         raise InputError(f"`start` of {label} is {str(start)[:40]}; write the seconds at which its first image was taken, such as -1.25.")
     if not is_number(drift) or abs(drift) > MOST_DRIFT_PPM:
         raise InputError(f"`drift_ppm` of {label} is {str(drift)[:40]}; write by how many millionths its clock is slow, such as 20.0.")
+    readout = entry.get("readout", 0.0)
+    if not is_number(readout) or abs(readout) > LONGEST_READOUT_S:
+        raise InputError(f"`readout` of {label} is {str(readout)[:40]}; write the seconds from its first row to the last, such as 0.016.")
     stamps = entry.get("timestamps")
     if stamps is not None and (not isinstance(stamps, str) or Path(stamps).is_absolute() or ".." in Path(stamps).parts):
         raise InputError(f"`timestamps` of {label} is {str(stamps)[:40]!r}; it must be a file inside the take's folder. Copy it there.")
-    return {"fps": None if fps is None else float(fps), "start_s": float(start), "drift_ppm": float(drift), "timestamps": stamps}
+    numbers = {"start_s": float(start), "drift_ppm": float(drift), "readout_s": float(readout)}
+    return {"fps": None if fps is None else float(fps), "timestamps": stamps, **numbers}
 
 
 def clocks_of(take: "Take", sequences: Sequence["ImageSequence"]) -> tuple[Clock, ...]:
@@ -113,7 +126,7 @@ def _clock(view: "View", rate: float, count: int, folder: Path) -> Clock:
     period = (1 + 1e-6 * view.drift_ppm) / (view.fps or rate)
     start = view.start_s - view.offset_frames / (view.fps or rate)
     if view.timestamps is None:
-        return Clock(start_s=start, period_s=period)
+        return Clock(start_s=start, period_s=period, readout_s=view.readout_s)
     stamps = read_timestamps(folder / view.timestamps, view.name)
     if len(stamps) != count:
         raise InputError(
@@ -122,7 +135,8 @@ def _clock(view: "View", rate: float, count: int, folder: Path) -> Clock:
         )
     times = view.start_s + (1 + 1e-6 * view.drift_ppm) * (stamps - stamps[0])
     usual = float(np.median(np.diff(times))) if count > 1 else period
-    return Clock(start_s=float(times[0]), period_s=usual, times_s=times - view.offset_frames * usual)
+    shifted = times - view.offset_frames * usual
+    return Clock(start_s=float(times[0]), period_s=usual, times_s=shifted, readout_s=view.readout_s)
 
 
 def read_timestamps(path: Path, view: str) -> np.ndarray:

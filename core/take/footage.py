@@ -51,6 +51,11 @@ class Footage:
         known = self.clocks[view].delay_images(self.number(view, frame), self.take.instant_s(frame)) if self.clocks else 0.0
         return known + (self.delay_images[view] if self.delay_images else 0.0)
 
+    def row_delays(self, view: int, frame: int, rows: int) -> np.ndarray:
+        """The same for each of the rows (rows,) of the image, which a rolling shutter exposes one after another."""
+        rolling = self.clocks[view].row_delays(rows) if self.clocks else np.zeros(rows)
+        return rolling + self.delay(view, frame)
+
     def single(self) -> "Footage":
         """The footage with one frame per image."""
         take, per = self.take.single(), self.take.field_layout.per_image
@@ -142,7 +147,7 @@ class Footage:
             if len(own) < 2 and sequence.count > 1:
                 files.append(own[0])
             else:
-                around = 1 if self.delay(k, frame) else 0
+                around = 1 if self.row_delays(k, frame, 2).any() else 0
                 files += own[max(number - around, 0) : number + around + 1]
         return files
 

@@ -79,6 +79,7 @@ class View:
     fps: float | None = None
     start_s: float = 0.0
     drift_ppm: float = 0.0
+    readout_s: float = 0.0  # of a rolling shutter
     timestamps: str | None = None
     mask: str | None = None
     masks: str | None = None
@@ -87,12 +88,13 @@ class View:
     @property
     def has_clock(self) -> bool:
         """Whether its images are not simply those of the take's frames, shifted by a number of frames."""
-        return self.fps is not None or self.timestamps is not None or bool(self.start_s or self.drift_ppm)
+        return self.fps is not None or self.timestamps is not None or bool(self.start_s or self.drift_ppm or self.readout_s)
 
     @property
     def clock(self) -> tuple[float | str | None, ...]:
         """What sets its clock, for digests; empty without one."""
-        return (self.fps, self.start_s, self.drift_ppm, self.timestamps) if self.has_clock else ()
+        rolls = (self.readout_s,) if self.readout_s else ()
+        return (self.fps, self.start_s, self.drift_ppm, self.timestamps, *rolls) if self.has_clock else ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
