@@ -15,9 +15,9 @@ Where no moving points can be tracked, (1) alone may give whole frames: for view
 has another rhythm from another side, and only where L correlates better than 0 by several sigmas (5). One rise and fall of the energy is
 one sample, however many frames it takes (Bartlett 1946, doi:10.2307/2983611).
 
-A rolling shutter exposes one row after the other. Where take.toml has the readout, s starts from it for every point, too; r in (4) is by how
-many frames the readout of view k, from the first row to the last, takes longer beyond that than that of the view it is compared with. Between
-cameras of one kind that see a point in the same row, r has no effect and does no harm.
+A rolling shutter exposes one row after the other. Where take.toml has the readout, s starts from it for every point, too; r in (4) is by
+how many frames the readout of view k, from the first row to the last, takes longer beyond that than that of the view it is compared
+with. Between cameras of one kind that see a point in the same row, r has no effect and does no harm.
 """
 
 from dataclasses import dataclass, replace

@@ -234,11 +234,11 @@ def test_clocks_of_views_survive_the_panel(project: ModuleType, blender: ModuleT
     """Keys that set a view's clock stay in take.toml, its clip starts with the frame that shows its first image, and no clicks are
     accepted in views that Blender shows at another rate."""
     scene, table = blender.context.scene, read_table(take) | {"keyframes": [], "seeds": {}, "frames": [4, 6]}
-    table["views"][0] |= {"start": 0.0812, "drift_ppm": 12.5, "offset_frames": 0}
+    table["views"][0] |= {"start": 0.0812, "drift_ppm": 12.5, "readout": 0.016, "offset_frames": 0}
     write_table(take, table)
     project.open_take(scene, take)
     written = project.table(scene)
-    assert {k: written["views"][0][k] for k in ("start", "drift_ppm")} == {"start": 0.0812, "drift_ppm": 12.5}
+    assert {k: written["views"][0][k] for k in ("start", "drift_ppm", "readout")} == {"start": 0.0812, "drift_ppm": 12.5, "readout": 0.016}
     assert scene.tricap.views[0].clip.frame_start == round(0.0812 * table["fps"]) == 2
     project.check_rates(scene)
     scene.tricap.views[2].fps = 2 * table["fps"]
