@@ -43,36 +43,24 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from .parameter_sets import PARAMETERS, reduced_sets
 from .patches import compare, patch_offsets, template_pixels
-from .warps import compose, starts_at_work
 
 LARGEST = 4096  # patches of a piece
 SHARED_FROM = 513  # patches from which on threads share them
 MIN_CONDITION = 1e-6  # added to the scaled diagonal of the whole one
+MAX_STEP_PX = 2.0  # px, longer steps are shortened
+MIN_DETERMINANT = 0.1  # of I + B; a smaller one has no usable inverse
 COMPACT_BELOW = 0.75  # of the patches at work: if fewer still move, the others are taken out of the arrays
+CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma is the last
+REST_SIGMAS = 0.1  # of the point's sigma, rest after the last step that is accepted where (6) predicts it
+REST_PX = 0.005  # px, the same, where it is more
 GRADIENT_NOISE = 0.45  # of (6)
 CURVATURE_RATE = 0.1  # smallest λ of (6)
 LINEAR_PX = 0.25  # px by which any part of the patch may move for (6) to apply
 SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled for the reported sigma0
-APPROXIMATE_ITERATIONS = 8  # after which an approximate match has not converged yet; nine in ten have by then
-HOPELESS_AFTER = 6  # iterations, after which an approximate match gives up
-HOPELESS_BELOW = 0.15  # by so much below the smallest correlation; of 13,000 points in 8 frames of two persons it takes 8
 INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
 TEXTURED_RMS = 0.5  # grey values, smallest RMS contrast of a patch
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # a 3×3 matrix from its upper part
 PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # arrays
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Ending:
-    """When a patch has converged. sigma: the point's own."""
-
-    step_px: float  # a step below this is the last,
-    step_sigmas: float = 0.25  # or below this part of sigma
-    rest_px: float = 0.005  # rest after the last step that is accepted where (6) predicts it,
-    rest_sigmas: float = 0.1  # or this part of sigma
-
-
-APPROXIMATE = Ending(step_px=0.05, step_sigmas=0.5, rest_px=0.02, rest_sigmas=0.25)  # for points that are measured again
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -173,24 +161,15 @@ class SearchImage:
 
 
 def match_patches(
-    template: TemplatePoints,
-    searches: Sequence[SearchImage],
-    settings: MatchingSettings,
-    *,
-    required: int = 0,
-    monitor: Monitor | None = None,
+    template: TemplatePoints, searches: Sequence[SearchImage], settings: MatchingSettings, *, monitor: Monitor | None = None
 ) -> list[Matches]:
-    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image.
-
-    With `required`, matches are approximate, for points that need so many of them and are measured again: they end earlier (`APPROXIMATE`),
-    and points that can no longer have enough are given up.
-    """
+    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image."""
     n = len(template.xy)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches], required)
+        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches])
 
     parts = in_threads(work, _pieces(n))
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
@@ -268,35 +247,26 @@ class PatchTemplates:
         mean, q = mean.astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
-    def find(self, searches: Sequence[SearchImage], required: int = 0) -> list[Matches]:
-        """Iterate (2) and (3) for all patches in every image, then judge them; `required` as in `match_patches`.
-
-        Rows go image after image.
-        """
+    def find(self, searches: Sequence[SearchImage]) -> list[Matches]:
+        """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
         N, transferred = len(self.inside), self._transferred()
         start, shape = (
             np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images])
             for of_images in ([search.start for search in searches], [search.shape for search in searches])
         )
-        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches), required)
+        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches))
         spans = [slice(k * N, (k + 1) * N) for k in range(len(searches))]
         return [
             self._judge(SearchImage(image=search.image, start=start[r], shape=shape[r]), settled.select(r), transferred)
             for search, r in zip(searches, spans)
         ]
 
-    def _settled(
-        self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray, required: int
-    ) -> "_Settled":
+    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> "_Settled":
         """The results of (2) and (3) for the patches that begin as NOT_CONVERGED."""
         most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
-        most, ending = (min(most, APPROXIMATE_ITERATIONS), APPROXIMATE) if required else (most, Ending(step_px=self._settings.converged_px))
         c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
         alive = status == MatchStatus.NOT_CONVERGED
-        harmless = starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
-        spare = len(images) - required if required else len(images)  # images in which a point may fail
-        vain = alive & self._given_up(~alive, np.arange(len(c)), spare)
-        status[vain], alive = MatchStatus.NOT_TRIED, alive & ~vain
+        harmless = _starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
         place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, harmless), np.where(alive[:, None, None], A, np.eye(2))
         work = _AtWork(self, images, place)
         for iteration in range(1, most + 1):
@@ -308,29 +278,16 @@ class PatchTemplates:
             step, rho, gain = work.step(at, warp)
             at, warp, moved = compose(at, warp, step)
             lost = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
-            status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
-            if required and iteration > HOPELESS_AFTER:
-                hopeless = rho < self._settings.min_correlation - HOPELESS_BELOW
-                status[place[alive & hopeless & ~lost]] = MatchStatus.LOW_CORRELATION
-                lost |= hopeless
-            near, spared = self._converged(step, moved, work.sigma(rho), ending)
-            if spare < len(images) and (alive & lost).any():
-                vain = alive & ~lost & self._given_up(alive & lost, place, spare)
-                status[place[vain]], lost = MatchStatus.NOT_TRIED, lost | vain
+            near, spared = self._converged(step, moved, work.sigma(rho))
             finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
             here = place[finished]
             rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
             c[here], A[here], correlation[here], iterations[here] = at[finished], warp[finished], rho[finished], iteration
-            good = (near | spared) & ~lost
-            status[place[alive & good]] = MatchStatus.OK
+            status[here] = np.where((near | spared)[finished], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
+            status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
             alive[finished] = False
             at[lost], warp[lost] = harmless[place[lost]], np.eye(2)
         return _Settled(c=c, A=A, status=status, correlation=correlation, iterations=iterations)
-
-    def _given_up(self, failed: np.ndarray, place: np.ndarray, spare: int) -> np.ndarray:
-        """Which of the patches in rows `place` (m,) belong to points of which more than `spare` have `failed` (m,) now."""
-        N = len(self.inside)
-        return np.asarray((np.bincount(place[failed] % N, minlength=N) > spare)[place % N])
 
     def _usable(self, searches: Sequence[SearchImage]) -> np.ndarray:
         """The statuses that patches have before they move; NOT_CONVERGED are those that can be matched."""
@@ -339,12 +296,12 @@ class PatchTemplates:
         status[lost] = MatchStatus.OUT_OF_IMAGE
         return status
 
-    def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray, ending: Ending) -> tuple[np.ndarray, np.ndarray]:
+    def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which patches' last step was small; and for which it predicts by (6) that the next would be."""
         rate = np.maximum(CURVATURE_RATE, GRADIENT_NOISE * self.n_pixels * sigma**2)
         linear = moved + self.half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
-        spared = linear & (moved < np.maximum(ending.rest_px, ending.rest_sigmas * sigma) / rate)
-        return moved < np.maximum(ending.step_px, ending.step_sigmas * sigma), spared
+        spared = linear & (moved < np.maximum(REST_PX, REST_SIGMAS * sigma) / rate)
+        return moved < np.maximum(self._settings.converged_px, CONVERGED_SIGMAS * sigma), spared
 
     def _transferred(self) -> np.ndarray | None:
         """E H⁻¹ Eᵀ of (5) (N, 2, 2)."""
@@ -404,6 +361,15 @@ class _Settled:
         return _Settled(**{f.name: getattr(self, f.name)[rows] for f in fields(_Settled)})
 
 
+def _starts_at_work(start: np.ndarray, alive: np.ndarray, images: int) -> np.ndarray:
+    """For each row (N · images, 2) a place among the starts of its image that are `alive`: no other part of it is to be interpolated."""
+    by_image, there = start.reshape(images, -1, 2), alive.reshape(images, -1)
+    if not there.size:
+        return start
+    first = np.where(there.any(axis=1)[:, None], by_image[np.arange(images), there.argmax(axis=1)], 0.0)
+    return np.repeat(first, there.shape[1], axis=0)
+
+
 class _AtWork:
     """The patches of a piece that still move: the rows `place` (m,) of all patches in all images, image after image."""
 
@@ -434,3 +400,21 @@ class _AtWork:
         """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
         variance = self._contrast.astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / self._dof
         return np.asarray(np.sqrt(variance * np.maximum(self._inverse[:, 0, 0], self._inverse[:, 3, 3])))
+
+
+def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px].  (3)"""
+    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
+    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
+    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
+    det = a * e - b * d
+    inverse = 1 / np.where(np.abs(det) < MIN_DETERMINANT, np.nan, det)
+    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
+    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
+    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
+    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
+    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
+    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
+    if bad.any():
+        A_new[bad], move[bad] = A[bad], 0.0
+    return c - move, A_new, moved

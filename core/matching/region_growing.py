@@ -19,11 +19,10 @@ from ..foundation.settings import knob
 from ..geometry.camera import Camera
 from ..geometry.intersection import Intersection, forward_intersection
 from .foreground import Foreground
-from .least_squares import Matches, MatchingSettings, MatchStatus, SearchImage, TemplatePoints, match_patches
+from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import Approximations
 from .views import TemplateGrid, Views
 
-CONTINUED = 2  # times that a point goes on from where its approximate matches are, together with the next front
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
 TEMPLATE_SIGMA_PX = 0.02  # px, of the template point itself, so that the adjustment can move it
 NOISE_SIGMAS = 4.0  # sigmas of a depth by which it may differ from its parent's, beyond the steepest slope
@@ -134,7 +133,7 @@ class _Cells:
         self.smoothed = np.zeros(cells, dtype=bool)
         self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
         self.accepted, self.tried = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=bool)
-        self.attempts, self.continued = np.zeros(cells, dtype=np.int16), np.zeros(cells, dtype=np.int16)  # of this round
+        self.attempts = np.zeros(cells, dtype=np.int16)  # of this round
 
     def accept(self, front: "Front", measured: "_Measured", views: Views) -> None:
         """Store what was measured at the cells of a front."""
@@ -278,7 +277,6 @@ class _Growth:
         self, views: Views, grid: TemplateGrid, growing: GrowingSettings, seeds: _Measured, foreground: Foreground, monitor: Monitor
     ) -> None:
         self._base, self._grid, self._growing, self._foreground, self._monitor = views.base, grid, growing, foreground, monitor
-        self._reference = views.reference
         self.cells = _Cells(grid, len(views.cameras))
         self.limit_px, self._rig_sigma_px = _rig_quality(seeds.matched, seeds.point, growing)
 
@@ -286,7 +284,7 @@ class _Growth:
         """One round: from the seeds, or, on a `restart`, from everything accepted so far."""
         cells, attempts, front = self.cells, self._growing.attempts, seeds
         if restart:
-            cells.attempts[:] = cells.continued[:] = 0
+            cells.attempts[:] = 0
             front = cells.next_front(np.flatnonzero(cells.accepted), attempts, self._base)
             front = _joined(cells, seeds, front) if with_seeds else front
         while len(front.cell):
@@ -294,28 +292,12 @@ class _Growth:
             cells.attempts[front.cell] += 1
             cells.tried[front.cell] = True
             xy = self._grid.xy(front.cell)
-            again = this.matching.constraint != "none"  # each point is measured again (`constraints`)
-            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs, approximate=again)
+            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs)
             good = self._acceptable(measured, front.parent_depth_m, this.views.required_matches(this.pairs))
-            moving = self._moving(front, measured, good if again else np.ones_like(good))
             front = front.select(good)
             cells.accept(front, measured.select(good), this.views)
             cells.smoothed[front.cell] = this.smoothed
-            front = _joined(cells, moving, cells.next_front(front.cell, attempts, self._base))
-
-    def _moving(self, front: "Front", measured: _Measured, good: np.ndarray) -> "Front":
-        """The points of a front whose approximate matches had not ended, from where they are: few points need most of the iterations."""
-        status = np.stack([m.status for m in measured.matched])
-        going_on = (status == MatchStatus.NOT_CONVERGED) | (status == MatchStatus.OK)
-        fresh = self.cells.continued[front.cell] < CONTINUED
-        rows = np.flatnonzero(fresh & ~good & going_on.all(axis=0) & (status == MatchStatus.NOT_CONVERGED).any(axis=0))
-        moving = front.select(rows)
-        search = np.delete(np.arange(front.start.shape[1]), self._reference)
-        moving.start[:, search] = np.stack([m.xy[rows] for m in measured.matched], axis=1)
-        moving.shape[:, search] = np.stack([m.shape[rows] for m in measured.matched], axis=1)
-        self.cells.continued[moving.cell] += 1
-        self.cells.attempts[moving.cell] -= 1  # the same attempt
-        return moving
+            front = cells.next_front(front.cell, attempts, self._base)
 
     def _acceptable(self, measured: _Measured, parent_depth_m: np.ndarray, matches: int) -> np.ndarray:
         """(n,) which points have enough matches, rays that meet, a depth that continues their parent's, and lie in the foreground."""
@@ -386,20 +368,11 @@ def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Fr
     return Front(cell=cell, start=start, shape=seeds.shape[first], parent_depth_m=np.full(len(cell), np.nan))
 
 
-def _measure(
-    views: Views,
-    xy: np.ndarray,
-    front: Front,
-    matching: MatchingSettings,
-    rig_sigma_px: float,
-    *,
-    pairs: bool,
-    approximate: bool = False,
-) -> _Measured:
+def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSettings, rig_sigma_px: float, *, pairs: bool) -> _Measured:
     """Match a front's points `xy` (n, 2) in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     template = TemplatePoints(image=views.template, xy=xy, row_step=views.rows.step)
     searches = [SearchImage(image=views.images[k], start=front.start[:, k], shape=front.shape[:, k]) for k in views.search]
-    matched = match_patches(template, searches, matching, required=views.required_matches(pairs) if approximate else 0)
+    matched = match_patches(template, searches, matching)
     image_xy = np.full((len(xy), len(views.cameras), 2), np.nan)
     rig = np.diag([1.0, 1 / views.rows.step**2]) * rig_sigma_px**2
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(views.cameras), 1, 1))

@@ -62,11 +62,11 @@ class Scene:
         """The images with the rig as it is now."""
         return views(self.images, self.rig)
 
-    def grown(self, settings: MatchingSettings = SETTINGS) -> MatchedField:
-        """The unconstrained field; approximate if a constraint is to follow."""
+    def grown(self) -> MatchedField:
+        """The unconstrained field."""
         grid = template_grid(self.images[1].shape, RowGrid(), 4)
         seeds = sweep_seeds(self.views, grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=Monitor())
-        return grow_regions(self.views, grid, seeds, settings, GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
+        return grow_regions(self.views, grid, seeds, SETTINGS, GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
 
 
 @pytest.fixture(scope="module")
@@ -213,14 +213,13 @@ def test_curvature_removes_the_flattening(surfaces: ModuleType) -> None:
 @pytest.mark.parametrize("kind", ["strong", "weak"])
 def test_constraints_reduce_the_error(surfaces: ModuleType, kind: str) -> None:
     scene = Scene(surfaces, surfaces.cylinder(0.06), kind)
-    rms, alone = {}, scene.grown(replace(SETTINGS, constraint="none"))
+    field = scene.grown()
+    rms = {}
     for constraint in ("none", "epipolar", "object"):
-        settings = replace(SETTINGS, constraint=constraint)
-        field = alone if constraint == "none" else scene.grown(settings)
-        found = constrain(field, scene.views, settings, foreground=EVERYWHERE, monitor=Monitor())
+        found = constrain(field, scene.views, replace(SETTINGS, constraint=constraint), foreground=EVERYWHERE, monitor=Monitor())
         error = scene.surface.distance_m(found.xyz_m)
         rms[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.005] ** 2))
-        assert len(found.cell) > (0.75 if constraint == "epipolar" else 0.87) * len(alone.cell)
+        assert len(found.cell) > (0.75 if constraint == "epipolar" else 0.87) * len(field.cell)
         assert np.isfinite(found.covariance_m2).all()
     assert rms["object"] < 0.9 * rms["none"]
     assert rms["epipolar"] < rms["none"]

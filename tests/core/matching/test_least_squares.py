@@ -325,28 +325,6 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
         assert found.sigma0 == pytest.approx(end.sigma0, rel=0.05) and np.mean(found.sigma0 / end.sigma0) == pytest.approx(1.0, abs=0.003)
 
 
-def test_approximate_matches_are_near_and_hopeless_points_are_given_up() -> None:
-    """Where two of two views are needed: half of the points show something else in the second view."""
-    a, b = noisy_pair(1.5, 1.0, (0.4, -0.3), 3)
-    other, c = shifted(speckle(1.5, 77), 0, 0), b.copy()
-    c[:, : SIZE // 2] = other[:, : SIZE // 2]
-    xy, eye = points(), np.tile(np.eye(2), (len(points()), 1, 1))
-    searches = [SearchImage(image=SplineImage(image), start=xy, shape=eye) for image in (b, c)]
-    template = TemplatePoints(image=SplineImage(a), xy=xy)
-    exact, near = (match_patches(template, searches, USUAL, required=required) for required in (0, 2))
-    both, left, right = np.logical_and(*(m.ok for m in exact)), xy[:, 0] < SIZE // 2 - 10, xy[:, 0] > SIZE // 2 + 10
-    assert both[right].mean() > 0.9 and both[left].mean() < 0.02  # by chance
-    assert np.array_equal(np.logical_and(*(m.ok for m in near))[right], both[right])
-    for k in range(2):
-        assert np.abs(near[k].xy - exact[k].xy)[right].max() < 0.1
-        assert near[k].iterations[right].mean() < exact[k].iterations[right].mean()
-    assert near[1].iterations[left].mean() < 0.6 * exact[1].iterations[left].mean()
-    searches[1] = SearchImage(image=searches[1].image, start=np.where(left[:, None], np.nan, xy), shape=eye)
-    first, _ = match_patches(template, searches, USUAL, required=2)
-    assert not first.iterations[left].any() and first.ok[right].any()  # the other view cannot help them
-    assert match_patches(template, searches, USUAL, required=1)[0].ok[left].any()
-
-
 def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -> None:
     """The result of a patch does not depend on the other patches. 1400 points are several pieces."""
     random = np.random.default_rng(2)
