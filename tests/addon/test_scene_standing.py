@@ -15,6 +15,7 @@ from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
 from tricap.core.foundation import store
+from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.floor import floor_height
 from tricap.core.motion.sources import from_run
 
@@ -187,3 +188,29 @@ def test_a_part_of_a_body_stands_nowhere(blender: ModuleType, small_run: Any) ->
     assert blender.data.objects["Body"].location.z == 0 and blender.context.scene.tricap.path == "BONE"
     blender.context.scene.tricap.path = "OBJECT"  # there is nothing to move
     assert blender.context.scene.tricap.path == "BONE"
+
+
+@pytest.mark.parametrize("kind", ["fbx", "glb"])
+def test_posed_fingers_are_exported(empty: ModuleType, out: Path, tmp_path: Path, kind: str) -> None:
+    """A finger that the animator bends arrives in other programs' files, with the skin that it deforms."""
+    from tricap.addon.retarget.export import exporting_played
+    from tricap.addon.retarget.files import open_moving
+    from tricap.addon.retarget.read import ended
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(out)
+    body, scene, bent = empty.data.objects["Body"], empty.context.scene, "f_index.02.R"
+    for frame, angle in ((scene.frame_start, 0.0), (scene.frame_end, 0.9)):
+        body.pose.bones[bent].rotation_euler.x = angle
+        body.pose.bones[bent].keyframe_insert("rotation_euler", index=0, frame=frame)
+    scene.frame_set(scene.frame_end)
+    wanted = [np.array(body.matrix_world @ body.pose.bones[name].head) for name in ("f_index.03.R", "thumb.03.L")]
+    ended(exporting_played(body, kind, tmp_path / f"a.{kind}", "plain", Monitor()))
+    armature = open_moving(tmp_path / f"a.{kind}")
+    names = {name.replace(".", "_"): name for name in armature.data.bones.keys()}
+    scene = empty.context.scene
+    scene.frame_set(round(armature.animation_data.action.frame_range[1]))
+    found = [np.array(armature.matrix_world @ armature.pose.bones[names[name]].head) for name in ("f_index_03_R", "thumb_03_L")]
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+    groups = {group.name.replace(".", "_") for o in empty.data.objects if o.type == "MESH" for group in o.vertex_groups}
+    assert {"f_index_02_R", "thumb_03_L"} <= groups
