@@ -8,6 +8,7 @@ import display
 import drive
 
 ESC_S = 1.0
+LONG = 20_000  # frames
 SAMPLE_S = 120.0  # with relief and texture
 
 
@@ -30,6 +31,30 @@ def steps() -> drive.Steps:
         drive.say("Blender said:", line)
     yield from drive.shot("3_done")
     yield from metaballs(area)
+    yield from export_stopped_by_esc(area)
+
+
+def export_stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
+    """An export of many frames, begun from the file browser: Esc stops it and leaves no file; without Esc it is written."""
+    scene, file, last = bpy.context.scene, drive.HERE / "long.bvh", bpy.context.scene.frame_end
+    for frames, stopped in ((LONG, True), (30, False)):
+        scene.frame_end = scene.frame_start + frames - 1
+        now = scene.frame_current
+        yield from drive.move(*drive.middle(area))
+        with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area, "WINDOW")):
+            bpy.ops.tricap.export("INVOKE_DEFAULT", kind="bvh")
+        yield from drive.choose("export", file.parent, file.name)
+        state = bpy.context.window_manager.tricap
+        if stopped:
+            yield from drive.wait_for(lambda: state.running and state.progress > 0, 20, "the export tells how far it is")
+            yield from drive.shot("5_exporting")
+            yield from stopped_by_esc(drive.area_of("VIEW_3D"))
+        else:
+            yield from drive.wait_for(file.is_file, 60, "the file is written")
+        drive.check(file.is_file() != stopped, "no file was written" if stopped else "it is there")
+        drive.check(scene.frame_current == now, "the scene is in its frame")
+        area = drive.area_of("VIEW_3D")
+    scene.frame_end = last
 
 
 def metaballs(area: bpy.types.Area) -> drive.Steps:
