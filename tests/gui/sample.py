@@ -37,6 +37,7 @@ def steps() -> drive.Steps:
 def export_stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
     """An export of many frames, begun from the file browser: Esc stops it and leaves no file; without Esc it is written."""
     scene, file, last = bpy.context.scene, drive.HERE / "long.bvh", bpy.context.scene.frame_end
+    state = bpy.context.window_manager.tricap
     for frames, stopped in ((LONG, True), (30, False)):
         scene.frame_end = scene.frame_start + frames - 1
         now = scene.frame_current
@@ -44,7 +45,6 @@ def export_stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
         with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area, "WINDOW")):
             bpy.ops.tricap.export("INVOKE_DEFAULT", kind="bvh")
         yield from drive.choose("export", file.parent, file.name)
-        state = bpy.context.window_manager.tricap
         if stopped:
             yield from drive.wait_for(lambda: state.running and state.progress > 0, 20, "the export tells how far it is")
             yield from drive.shot("5_exporting")
