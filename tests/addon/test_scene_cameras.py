@@ -155,3 +155,21 @@ def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, 
     assert np.median(np.abs(difference)) < 2.0 and abs(difference.mean()) < 1.0  # of 255; the next frame is brighter by 30
     footage_plane.show(scene, False)
     assert not footage_plane.shown(scene) and not floor.hide_render and scene.view_settings.view_transform == before
+
+
+def test_a_fisheye_lens_survives_the_scene_and_is_told_of(empty: ModuleType) -> None:
+    """Blender's clips do not have it: the scene warns, and gives back the calibrated camera."""
+    from tricap.addon.calibrate.cameras import EXACT, camera_of, exact_values
+    from tricap.addon.scene import axes, cameras
+    from tricap.core.geometry.rig import Rig
+
+    camera = dataclasses.replace(small_rig().cameras[0], fisheye=True, distortions=np.array([0.06, -0.02, 0.008, -0.0015, 0.0]))
+    scene = empty.context.scene
+    cameras.frame_render(scene, camera)
+    shown = cameras.add_camera(scene.collection, camera)
+    shown[EXACT] = exact_values(camera)
+    empty.context.view_layer.update()
+    again = camera_of(scene, shown)
+    assert again.fisheye and again.distortions.tolist() == camera.distortions.tolist()
+    assert not any(axes.brown_coefficients(camera).values())
+    assert "has a fisheye lens" in cameras.frame_faults(Rig(cameras=(camera,)), camera)[0]
