@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tricap.core.checking.view_matches import epipolar_distance_px
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
@@ -44,3 +45,13 @@ def test_matching_is_as_accurate_far_from_the_axis_of_a_fisheye_lens(clouds: dic
     assert len(clouds["fisheye"]) > 0.8 * len(clouds["brown"]) > 100
     assert clouds["fisheye"].std() < 1.1 * clouds["brown"].std()
     assert abs(clouds["fisheye"].mean()) < 0.06 * scenes.pixel_m
+
+
+def test_points_off_their_epipolar_curves_are_told_in_pixels(scenes: Any) -> None:
+    target = np.array([0.0, 0.0, scenes.depth_m])
+    a, b, _ = (turned_away(c, target) for c in scenes.three_cameras().cameras)
+    X = target + np.random.default_rng(0).uniform(-0.2, 0.2, (50, 3))
+    xa, xb = a.project(X), b.project(X)
+    across = np.stack([epipolar_distance_px(a, b, xa, xb + step) for step in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])])
+    assert np.abs(across[0]).max() < 1e-6
+    assert np.abs(np.linalg.norm(across[1:], axis=0) - 1).max() < 0.35  # a pixel is not quite as large along and across the radius
