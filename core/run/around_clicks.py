@@ -19,6 +19,7 @@ from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, read_skin
 from ..body.skin.posed import Poser
 from ..fitting.inputs.cloud_points import Cloud, tracked_clouds
+from ..fitting.inputs.completed_clouds import completed_clouds
 from ..fitting.inputs.no_surface import background_regions, empty_clouds
 from ..fitting.inputs.take_inputs import check_body, fit_input
 from ..fitting.stages.fit_again import EarlierFit, around, fit_again, with_held
@@ -35,7 +36,7 @@ from ..surface.measure import last_cloud
 from ..take.footage import Footage, open_take
 from ..take.take import FrameClicks, read_take
 from ..tracking.corrections import corrected_cloud
-from ..tracking.trajectories import Trajectories, read_trajectories
+from ..tracking.trajectories import read_trajectories
 from .record import FrameTable, frame_list, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import stage_keys
@@ -201,14 +202,13 @@ def _fitted(
     trajectories = read_trajectories(results.folder) if fitting.use_surface else None
     background = background_regions(footage, results, clouds, fitting, monitor, wider)
     part = replace(footage, frames=footage.frames[wider.start : wider.stop])
-    given = fit_input(part, _clouds_of(part, clouds, wider, trajectories, fitting.cloud), trajectories, results, background)
+    window: Sequence[Cloud] = [clouds[row] for row in wider]
+    if fitting.cloud == "tracked" and trajectories is not None:
+        window = tracked_clouds(trajectories, part.frames)
+    elif fitting.complete_surface and fitting.use_surface:
+        window = completed_clouds(part, [clouds[row] for row in wider], background, results, monitor)
+    given = fit_input(part, window, trajectories, results, background)
     return fit_again(given, body.earlier, rows, joints, fitting, monitor)
-
-
-def _clouds_of(part: Footage, clouds: Sequence[PointCloud], wider: range, trajectories: Trajectories | None, kind: str) -> Sequence[Cloud]:
-    if kind == "tracked" and trajectories is not None:
-        return tracked_clouds(trajectories, part.frames)
-    return [clouds[row] for row in wider]
 
 
 def _write(results: Results, settings: SkinSettings, body: _Body, parts: Sequence[BodyMotion]) -> None:
