@@ -5,6 +5,7 @@ import json
 import bpy
 import numpy as np
 
+from ...core.foundation import bounded
 from ...core.foundation.errors import InputError
 from ...core.geometry.intersection import clicks_contradict, intersect_clicks
 from ..overlay import canvas, draw
@@ -63,7 +64,7 @@ def height_of(scene: bpy.types.Scene, clicks: str) -> float:
         InputError: they are no list of clicks in two views, there is no such view, or their rays miss each other.
     """
     try:
-        at = {str(view): (float(x), float(y)) for view, x, y in json.loads(clicks)}
+        at = {str(view): (float(x), float(y)) for view, x, y in bounded.json_of(clicks)}
     except (ValueError, TypeError) as error:
         raise InputError(f"The clicks {clicks!r} are not a list; write them as [[view, x, y], [view, x, y]].") from error
     cameras = cameras_of(scene)
