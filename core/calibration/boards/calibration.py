@@ -211,6 +211,10 @@ def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], list[str]
             if len(run) >= LONG_RUN:
                 where += f", among them all from {run[0]} to {run[-1]}"
             doubts.append(f"camera {name}, moved, exchanged or not synchronised, disagrees with the others {where}")
+    some = len(np.unique(apart[:, 0]))
+    pairs = sum(views[labelled.frames == frame].sum() >= 2 for frame in np.unique(labelled.frames))
+    if not doubts and some > MANY_APART * pairs:  # shared out among the cameras
+        doubts.append(f"the cameras disagree in {some} of {pairs} images; was one of them moved, exchanged or not synchronised?")
     return lines, doubts
 
 

@@ -167,6 +167,18 @@ def test_a_moved_camera_is_never_good(turned: float, said: str) -> None:
     assert done.verdict.light != "green" and said in done.verdict.sentence
 
 
+def test_two_cameras_that_disagree_are_never_good() -> None:
+    """One is turned halfway: each of them is apart in a quarter of the images, so that neither alone is in doubt."""
+    rng = np.random.default_rng(14)
+    held = held_board(random_cameras(rng, "parallel")[:2], CHESSBOARD.corners_m, 24, rng, sigma_px=0.1)
+    apart = np.arange(24) % 3 == 1
+    xy = held.xy_px.copy()
+    for c in range(2):
+        xy[apart & (np.arange(24) % 2 == c), c] += [12.0, 20.0]
+    done = calibrate_rig(observed(replace(held, xy_px=xy)), Monitor())
+    assert done.verdict.light != "green" and "the cameras disagree in 8 of 24 images" in done.verdict.sentence
+
+
 def test_cameras_exchanged_towards_the_end_are_never_good() -> None:
     held = drawn(3, sigma_px=0.1)
     xy = held.xy_px.copy()
