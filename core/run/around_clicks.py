@@ -18,8 +18,7 @@ from ..body.skin.fingers import shape_for_skin
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, read_skin
 from ..body.skin.posed import Poser
-from ..fitting.inputs.cloud_points import Cloud, tracked_clouds
-from ..fitting.inputs.completed_clouds import completed_clouds
+from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.no_surface import background_regions, empty_clouds
 from ..fitting.inputs.take_inputs import check_body, fit_input
 from ..fitting.stages.fit_again import EarlierFit, around, fit_again, with_held
@@ -202,12 +201,8 @@ def _fitted(
     trajectories = read_trajectories(results.folder) if fitting.use_surface else None
     background = background_regions(footage, results, clouds, fitting, monitor, wider)
     part = replace(footage, frames=footage.frames[wider.start : wider.stop])
-    window: Sequence[Cloud] = [clouds[row] for row in wider]
-    if fitting.cloud == "tracked" and trajectories is not None:
-        window = tracked_clouds(trajectories, part.frames)
-    elif fitting.complete_surface and fitting.use_surface:
-        window = completed_clouds(part, [clouds[row] for row in wider], background, results, monitor)
-    given = fit_input(part, window, trajectories, results, background)
+    chosen = clouds_for_fit(part, [clouds[row] for row in wider], trajectories, background, fitting, results, monitor)
+    given = fit_input(part, chosen, trajectories, results, background)
     return fit_again(given, body.earlier, rows, joints, fitting, monitor)
 
 

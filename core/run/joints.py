@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..fitting.inputs.background import find_background
-from ..fitting.inputs.completed_clouds import completed_clouds
+from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.no_surface import empty_clouds
 from ..fitting.inputs.start_joints import StartJoints
 from ..fitting.inputs.take_inputs import fit_input
@@ -48,8 +48,7 @@ def joints_of_take(take_folder: Path, overrides: Overrides | None, monitor: Moni
     background = find_background(footage, clouds, monitor) if settings["fitting"].use_background else []
     with tempfile.TemporaryDirectory() as folder:
         results = Results(Path(folder))
-        complete = settings["fitting"].complete_surface
-        completed = completed_clouds(footage, clouds, background, results, monitor) if complete else clouds
+        completed = clouds_for_fit(footage, clouds, None, background, settings["fitting"], results, monitor)
         given = fit_input(footage, completed, None, results, background)
         start = find_joints(given, settings["fitting"], monitor.part("find the person", 1, 2))
     if start is None:

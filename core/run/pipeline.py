@@ -4,7 +4,6 @@ Every stage asks the stages before it for their results. What has a checkpoint i
 """
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,8 @@ from ..body.skin.texture import TextureBaker
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
-from ..fitting.inputs.cloud_points import Cloud, tracked_clouds
-from ..fitting.inputs.completed_clouds import completed_clouds
-from ..fitting.inputs.fit_input import BackgroundDistances, FitInput
+from ..fitting.inputs.completed_clouds import clouds_for_fit
+from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
@@ -257,8 +255,7 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     """Fit the body and write it, track once more with its help, and compare silhouettes; gives the figures of the tracks, too."""
     fitting = run.settings["fitting"]
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
-    tracked = tracked_clouds(run.trajectories, run.footage.frames) if fitting.cloud == "tracked" and run.trajectories else None
-    clouds = tracked or _completed(run, background, monitor)
+    clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
     given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
     given = with_start(given, fitting, monitor)
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
@@ -269,13 +266,6 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     outlines = outline_polygons(run.footage, run.results)
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again
-
-
-def _completed(run: Run, background: Sequence[BackgroundDistances], monitor: Monitor) -> Sequence[Cloud]:
-    """The clouds, with the coarse surface of the person where nothing was measured."""
-    if not run.settings["fitting"].complete_surface or run.surfaceless:
-        return run.clouds
-    return completed_clouds(run.footage, run.clouds, background, run.results, monitor)
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:

@@ -15,7 +15,9 @@ from ...results.folder import Results
 from ...surface.cloud import PointCloud
 from ...surface.coarse import coarse_surfaces
 from ...take.footage import Footage
-from .cloud_points import Cloud
+from ...tracking.trajectories import Trajectories
+from ..settings import FitSettings
+from .cloud_points import Cloud, tracked_clouds
 from .fit_input import BackgroundDistances
 
 NEAR_M = 0.014  # a measured point so near is the better one
@@ -70,16 +72,25 @@ class CompletedClouds(Sequence[Cloud]):
         return inside & known
 
 
-def completed_clouds(
-    footage: Footage, clouds: Sequence[PointCloud], background: Sequence[BackgroundDistances], results: Results, monitor: Monitor
+def clouds_for_fit(
+    footage: Footage,
+    clouds: Sequence[PointCloud],
+    trajectories: Trajectories | None,
+    background: Sequence[BackgroundDistances],
+    settings: FitSettings,
+    results: Results,
+    monitor: Monitor,
 ) -> Sequence[Cloud]:
-    """The clouds with the coarse surface of the person; the clouds alone where no view shows a still background.
+    """The clouds that attract the body: the measured ones, completed by the coarse surface where a view shows a still background; or those
+    that tracking cleaned.
 
     Raises:
         InputError: the images cannot be read.
         Cancelled: the user asked to stop.
     """
-    if not background:
+    if settings.cloud == "tracked" and trajectories is not None:
+        return tracked_clouds(trajectories, footage.frames)
+    if not settings.complete_surface or not background:
         return clouds
     coarse = coarse_surfaces(footage, clouds, results, monitor)
     return CompletedClouds(clouds=clouds, coarse=coarse, rig=footage.rig, background=background)
