@@ -78,6 +78,15 @@ def tiny_graph(shape: Shape, *, inputs: int = 1, outputs: int = 1) -> bytes:
     return _whole(graph + b"".join(_field(12, _value(f"out{i}", shape)) for i in range(outputs)))
 
 
+def costly_graph(copies: int, layers: int) -> bytes:
+    """A network of a few kilobytes that makes so many copies of its maps, and looks over them so many times."""
+    weights = {"w": np.ones((17, 3, 1, 1)), "copies": np.array([copies, 17, 64, 48])}
+    nodes = [_node("Conv", ["image", "w"], "points", kernel_shape=[1, 1]), _node("Expand", ["points", "copies"], "many")]
+    nodes += [_node("Relu", ["many" if i == 0 else f"layer{i - 1}"], f"layer{i}") for i in range(layers)]
+    nodes.append(_node("ReduceMax", [f"layer{layers - 1}" if layers else "many"], "maps", axes=[0], keepdims=1))
+    return _model(nodes, (1, 3, 64, 48), {"maps": (1, 17, 64, 48)}, weights)
+
+
 def _model(nodes: list[bytes], image: Shape, outputs: dict[str, Shape], weights: dict[str, np.ndarray]) -> bytes:
     graph = b"".join(_field(1, n) for n in nodes) + _field(2, "g") + b"".join(_field(5, _tensor(k, v)) for k, v in weights.items())
     return _whole(graph + _field(11, _value("image", image)) + b"".join(_field(12, _value(k, s)) for k, s in outputs.items()))

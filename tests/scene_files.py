@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +47,13 @@ def packed(node: list[Any], at: int, head: str) -> bytes:
     return struct.pack(head, start + len(records), claimed, len(body) - len(name), len(name)) + body + records
 
 
-def write_fbx(path: Path, objects: list[Any], version: int = 7400) -> Path:
-    """A file with those objects, for Blender's importer, too."""
+def write_fbx(path: Path, objects: list[Any], version: int = 7400, joined: Sequence[tuple[int, int]] = ((1, 0),)) -> Path:
+    """A file with those objects and connections (of child and parent), for Blender's importer, too."""
     scale = [text(b"UnitScaleFactor"), text(b"double"), text(b"Number"), text(b""), b"D" + struct.pack("<d", 1.0)]
     settings = record(b"GlobalSettings", [], [record(b"Properties70", [], [record(b"P", scale)])])
-    joined = record(b"Connections", [], [record(b"C", [text(b"OO"), number(1), number(0)])])
+    connections = record(b"Connections", [], [record(b"C", [text(b"OO"), number(a), number(b)]) for a, b in joined])
     data, head = MAGIC + struct.pack("<I", version), "<QQQB" if version >= 7500 else "<IIIB"
-    for top in (settings, record(b"Objects", [], objects), joined):
+    for top in (settings, record(b"Objects", [], objects), connections):
         data += packed(top, len(data), head)
     path.write_bytes(data + b"\0" * (struct.calcsize(head) + 200))
     return path

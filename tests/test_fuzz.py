@@ -68,6 +68,10 @@ def test_bombs_are_refused_before_they_unpack(tmp_path: Path) -> None:
     for name in ("a.png", "a.pgm"):
         with pytest.raises(InputError, match="30000×30000 pixels, more than can be measured"):
             read_image(tmp_path / name)
+    scan, picture = b"\xff\xda\x00\x08\x01\x01\x00\x01\x3f\x00", cv2.imencode(".jpg", np.zeros((9, 9), np.uint8))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(picture[:-2] + 1000 * scan + picture[-2:])  # of a progressive one each passes over the whole image
+    with pytest.raises(InputError, match="is not a readable image"):
+        read_image(tmp_path / "a.jpg")
     store.save(tmp_path / "a.npz", {"zeros": np.zeros(500_000_000, np.int8)}, {})
     assert (tmp_path / "a.npz").stat().st_size < 1_000_000
     with pytest.raises(InputError, match="would unpack to 0.5 GB"):

@@ -73,7 +73,7 @@ def _open(path: Path) -> int:
 
 
 def _handle(path: Path) -> int:
-    """The opened lock file; a link is never followed, because its target would be overwritten.
+    """The opened lock file; a link is never followed, and a second name of a file not used, because that would be overwritten.
 
     Raises:
         InputError: it is a link, or no regular file.
@@ -91,7 +91,8 @@ def _handle(path: Path) -> int:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise refused from error
         raise
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
+    state = os.fstat(handle)
+    if not stat.S_ISREG(state.st_mode) or state.st_nlink > 1:  # a second name is a file of somebody's, elsewhere
         os.close(handle)
         raise refused
     return handle

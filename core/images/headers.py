@@ -5,6 +5,7 @@ import struct
 
 JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers with the size
 TIFF_KINDS = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4), 16: ("Q", 8)}
+MOST_SCANS = 100  # of a progressive JPEG, each of which passes over the whole image
 MOST_ENTRIES = 4096  # of a TIFF directory
 
 
@@ -29,6 +30,8 @@ def _png(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
+    if data.count(b"\xff\xda") > MOST_SCANS:
+        return None
     at = 2
     while at + 9 < len(data):
         if data[at] != 0xFF:

@@ -7,6 +7,7 @@ Points whose rays miss each other by more than clicks may are given up in the vi
 
 import glob
 import json
+import signal
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ FOLDER, ENDING = "keypoints", ".network.json"  # in the take's folder
 SIGMA_OF_HEIGHT, LEAST_SIGMA_PX = 0.02, 2.0  # of a confident point, about the person's height: 35 mm of a person of 1.75 m
 LEAST_HEIGHT = 0.15  # of the image's, of a region that may be the person
 TRIAL = "core.cli.network_trial"  # the module that tries a network
+OVER_TIME = int(getattr(signal, "SIGXCPU", 0)) or 1 << 20  # how a trial ends that computes too long; Windows has no such limit
 LOOK_S, LONGEST_S = 0.2, 300.0  # between two looks at the trial, and its longest time
 OVERLAP = 0.7  # of two boxes, below which the network looks again
 Box = tuple[float, float, float, float]  # left, top, right, bottom
@@ -82,6 +84,8 @@ def open_network(path: Path, monitor: Monitor) -> PoseNetwork:
         else:
             trial.kill()
             raise InputError(f"OpenCV needs more than {LONGEST_S / 60:.0f} minutes for one run of {path}; use a smaller network.")
+    if trial.returncode == -OVER_TIME:
+        raise InputError(f"{path} computes longer than a network of its size does; use another.")
     if trial.returncode or not answer:
         raise InputError(f"OpenCV crashes when it opens {path}; the file is damaged, or of a kind that OpenCV does not know.")
     if error := bounded.json_of(answer).get("error"):

@@ -68,7 +68,18 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
+ANY_DEPTH = "**"  # in a pattern: folders within each other. Several of it take pathlib of Python 3.11 a time that grows exponentially
 PERSON_SOURCES = ("mask", "masks", "background")  # keys of [[views]]; a view has at most one of them
+
+
+def check_pattern(pattern: Any, label: str) -> None:
+    """Check a pattern of files.
+
+    Raises:
+        InputError: it looks into folders of any depth more than once.
+    """
+    if isinstance(pattern, str) and pattern.count(ANY_DEPTH) > 1:
+        raise InputError(f"The {label} has a pattern with more than one “{ANY_DEPTH}”; name the folder, as in “C/*.png”.")
 
 
 def person_source(entry: Mapping[str, Any], label: str) -> dict[str, str]:
@@ -82,6 +93,7 @@ def person_source(entry: Mapping[str, Any], label: str) -> dict[str, str]:
         raise InputError(f"The {label} has {' and '.join(f'`{key}`' for key in sources)}; keep one of them.")
     for key, name in sources.items():
         inside(Path(), name, label, key)
+        check_pattern(name, label)
     return sources
 
 
@@ -148,6 +160,7 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
     files, view, names = table.get("files"), table.get("view", ""), table.get("names", {})
     if not isinstance(files, str) or Path(files).is_absolute() or ".." in Path(files).parts:
         raise InputError(f'`files` of a {where} is {files!r}; it must be files inside the take\'s folder, such as "kp/C/*.json".')
+    check_pattern(files, where)
     kind = Path(files).suffix.lower()
     if kind not in PIXELS + SPACE:
         raise InputError(f"`files` of a {where} is {files!r}; keypoints are read from {', '.join(PIXELS + SPACE)}.")

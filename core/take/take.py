@@ -22,6 +22,7 @@ from .sources import (
     PERSON_SOURCES,
     KeypointSource,
     check_keys,
+    check_pattern,
     frame_pair,
     inside,
     is_number,
@@ -283,6 +284,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
             raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
+        check_pattern(entry.get("images"), label)
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
         views.append(View(name=entry["name"], offset_frames=offset, **files, **view_clock(entry, label)))
     if len({v.name.casefold() for v in views}) < len(views):

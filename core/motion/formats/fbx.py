@@ -1,8 +1,9 @@
 """FBX: what Blender's importer would make of a binary file, counted before it does. The file itself is read by Blender.
 
 The importer trusts what a file says of itself: it makes a list for as many values as a record claims to have, and unpacks arrays of any
-length, so that 900 kB can become 2 GB. Layout of the records: A. Gessler, "FBX binary file format specification", Blender developers' blog
-(2013); from version 7500 on, with words of 64 bits.
+length, so that 900 kB can become 2 GB. It also follows the connections between objects (curve → layer → stack, shape → channel → mesh) on
+every path, of which a few thousand connections can make millions. Layout of the records: A. Gessler, "FBX binary file format
+specification", Blender developers' blog (2013); from version 7500 on, with words of 64 bits.
 """
 
 import struct
@@ -15,12 +16,13 @@ from ...foundation.errors import InputError
 
 MAGIC = b"Kaydara FBX Binary  \0\x1a\0"
 WIDE_FROM = 7500  # the version from which words have 64 bits
-SINGLE = {"Z": 1, "Y": 2, "B": 1, "C": 1, "I": 4, "F": 4, "D": 8, "L": 8}  # bytes of a value, by its kind
+SINGLE = {"Z": 1, "Y": 2, "B": 1, "C": 1, "I": 4, "F": 4, "D": 8}  # bytes of a value, by its kind
 ARRAYS = {"b": 1, "c": 1, "i": 4, "l": 8, "f": 4, "d": 8}  # bytes of an element
 TEXTS = "RS"
 DEEPEST = 64  # records in each other
 MOST_OBJECTS = 5_000  # models, meshes, materials, …: whatever becomes a thing of Blender's
 MANY = ("AnimationCurve", "AnimationCurveNode", "Deformer", "NodeAttribute")  # are parts of others
+MOST_PATHS, STEPS = 1_000_000, 4  # along so many connections
 MOST_UNPACKED = 100_000_000  # bytes
 MOST_RATIO = 100  # times its size, for larger files
 PIECE = 1 << 20
@@ -35,7 +37,10 @@ def check_fbx(path: Path) -> None:
     try:
         with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
             if file.read(len(MAGIC)) == MAGIC:
-                _Walk(file, path).all()
+                walk = _Walk(file, path)
+                walk.all()
+                if _paths(walk.joined) > MOST_PATHS:
+                    raise InputError(f"{path} connects its objects in more than {MOST_PATHS} ways; export the rig alone.")
     except (OSError, ValueError, struct.error, zlib.error, RecursionError) as error:
         raise InputError(f"{path} is not an FBX file that can be read ({error}); it is damaged, export it again.") from error
 
@@ -47,6 +52,7 @@ class _Walk:
         self._file, self._path = file, path
         self._size = path.stat().st_size
         self._unpacked = self._objects = 0
+        self.joined: list[tuple[int, int]] = []  # the objects that are connected, by their numbers: child and parent
 
     def all(self) -> None:
         """Every record of the file."""
@@ -69,15 +75,17 @@ class _Walk:
         self._objects += parent == "Objects" and name not in MANY
         if self._objects > MOST_OBJECTS:
             raise InputError(f"{self._path} has more than {MOST_OBJECTS} objects; export the rig alone.")
-        for _ in range(values):
-            self._value(end)
+        numbers = [found for _ in range(values) if (found := self._value(end)) is not None]
+        if parent == "Connections" and len(numbers) > 1:
+            self.joined.append((numbers[0], numbers[1]))
         while self._file.tell() < end and self._record(end, depth + 1, name):
             pass
         if self._file.tell() != end:
             raise ValueError("a record that does not end where it claims to")
         return True
 
-    def _value(self, end: int) -> None:
+    def _value(self, end: int) -> int | None:
+        """Pass a value; returns it if it is a number of an object."""
         kind = self._file.read(1).decode("latin-1")
         if kind in ARRAYS:
             count, packed, length = self._read("<III")
@@ -87,10 +95,13 @@ class _Walk:
             (length,) = self._read("<I")
             self._fits(length, end)
             self._file.seek(length, 1)
+        elif kind == "L":
+            return self._read("<q")[0]
         elif kind in SINGLE:
             self._file.seek(SINGLE[kind], 1)
         else:
             raise ValueError("a value of an unknown kind")
+        return None
 
     def _fits(self, length: int, end: int) -> None:
         if self._file.tell() + length > end:
@@ -104,6 +115,18 @@ class _Walk:
         found = _unpacked_size(data, claimed) if packed else len(data)
         if found != claimed:
             raise ValueError("an array whose length is not as it claims")
+
+
+def _paths(joined: list[tuple[int, int]]) -> int:
+    """The number of paths from child to parent along STEPS connections or fewer, counted to a little more than MOST_PATHS in each step."""
+    parents: dict[int, list[int]] = {}
+    for child, parent in joined:
+        parents.setdefault(child, []).append(parent)
+    total, ways = 0, dict.fromkeys(parents, 1)  # that begin with an object
+    for _ in range(STEPS):
+        ways = {child: min(sum(ways.get(parent, 1) for parent in above), 2 * MOST_PATHS) for child, above in parents.items()}
+        total = max(total, sum(ways.values()))
+    return total
 
 
 def _unpacked_size(data: bytes, most: int) -> int:

@@ -89,6 +89,9 @@ def test_a_link_in_its_place_is_not_followed(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="is a link, or no file; remove it"), locked(tmp_path / "out"):
             pass
         os.unlink(tmp_path / "out" / NAME) if make is os.mkfifo else os.rmdir(tmp_path / "out" / NAME)
+    os.link(tmp_path / "letter.txt", tmp_path / "out" / NAME)
+    with pytest.raises(InputError, match="is a link, or no file; remove it"), locked(tmp_path / "out"):
+        pass
     assert (tmp_path / "letter.txt").read_text() == "mine" and not (tmp_path / "not there yet").exists()
 
 

@@ -28,6 +28,14 @@ def test_round_trip(tmp_path: Path, compress: bool) -> None:
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="hard links need a right on Windows")
+def test_other_names_of_a_file_keep_its_content(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("mine")
+    os.link(tmp_path / "letter.txt", tmp_path / "run.json")
+    store.write_text(tmp_path / "run.json", "{}")
+    assert (tmp_path / "run.json").read_text() == "{}" and (tmp_path / "letter.txt").read_text() == "mine"
+
+
 @pytest.mark.parametrize("compress", [True, False])
 def test_a_file_with_a_wrong_byte_is_refused_or_gives_the_same_arrays(tmp_path: Path, compress: bool) -> None:
     path = tmp_path / "a.npz"

@@ -48,6 +48,18 @@ def test_an_fbx_file_that_asks_for_more_than_it_contains(tmp_path: Path, objects
     assert time.process_time() - began < 2.0 and memory_mb()[1] - before < 200
 
 
+def test_objects_that_are_connected_in_millions_of_ways(tmp_path: Path) -> None:
+    """Curves in every layer, layers in every stack: the importer makes an action for each way. A character has one way for each bone."""
+    levels = [range(40 * i + 1, 40 * i + 41) for i in range(5)]
+    every = [(child, parent) for below, above in zip(levels, levels[1:]) for child in below for parent in above]
+    objects = [model(i) for level in levels for i in level]
+    assert write_fbx(tmp_path / "a.fbx", objects, joined=every).stat().st_size < 1_000_000
+    with pytest.raises(InputError, match="connects its objects in more than 1000000 ways"):
+        check_fbx(tmp_path / "a.fbx")
+    chain = [(i, i - 1) for i in range(1, 4000)] + [(5000, i) for i in range(1, 4000)]
+    check_fbx(write_fbx(tmp_path / "b.fbx", [model(i) for i in range(1, 4000)], joined=chain))
+
+
 def test_records_in_each_other(tmp_path: Path) -> None:
     deep = model(1)
     for _ in range(100):

@@ -1,6 +1,7 @@
 """`tricap joints TAKE --model FILE.onnx`: a network finds the joints in every image; rays of the views are compared; the fit reads them."""
 
 import json
+import sys
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from tricap.core.run.network_joints import joints_by_network, open_network, with
 from tricap.core.take.footage import Footage, open_take
 from tricap.core.take.take import read_take
 
-from ...pose_graphs import drawn, pose_graph
+from ...pose_graphs import costly_graph, drawn, pose_graph
 from ..conftest import Scenes
 
 FRAMES, JOINTS = 6, 17
@@ -115,6 +116,17 @@ def test_a_network_on_which_opencv_crashes_is_refused(tmp_path: Path) -> None:
         open_network(tmp_path / "pose.onnx", Monitor())
     with pytest.raises(InputError, match="Cannot read .*nothing.onnx"):
         open_network(tmp_path / "nothing.onnx", Monitor())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+@pytest.mark.parametrize(
+    ("copies", "layers", "said"),
+    [(10_000, 0, "Failed to allocate"), pytest.param(1_000, 300, "computes longer than a network of its size", marks=pytest.mark.slow)],
+)
+def test_a_small_network_that_asks_for_gigabytes_or_minutes_is_refused(tmp_path: Path, copies: int, layers: int, said: str) -> None:
+    (tmp_path / "pose.onnx").write_bytes(costly_graph(copies, layers))
+    with pytest.raises(InputError, match=said):
+        open_network(tmp_path / "pose.onnx", Monitor())
 
 
 def test_a_link_out_of_the_take_is_not_followed(take: Path, footage: Footage, tmp_path: Path) -> None:
