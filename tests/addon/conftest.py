@@ -39,6 +39,13 @@ model = "arm.R"
 """
 
 
+def with_small_texture(take: Path) -> Path:
+    """A take whose skin gets a small texture: the usual one takes as long as all else of a run of a few frames."""
+    with (take / "take.toml").open("a", encoding="utf-8") as file:
+        file.write("[settings.skin]\ntexture_px = 64\n")
+    return take
+
+
 class NeedsBlender(pytest.Module):
     """A module of tests that is skipped, and says why, in a Python without bpy."""
 

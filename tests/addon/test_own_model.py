@@ -11,17 +11,19 @@ from tricap.core.run import pipeline, take_run
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.writing import read_table, write_table
 
+from .conftest import with_small_texture
+
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small recording of an arm whose body is mine.toml, a part of theirs.toml."""
     folder = tmp_path_factory.mktemp("own") / "take"
-    make_arm_take(folder, ArmTakeSettings(width_px=320, frames=4, interlaced="none"))
+    make_arm_take(folder, ArmTakeSettings(width_px=256, frames=3, interlaced="none"))
     theirs = (MODELS / "arm.R.toml").read_text(encoding="utf-8").replace('name = "arm.R"', 'name = "theirs"')
     (folder / "theirs.toml").write_text(theirs, encoding="utf-8")
     (folder / "mine.toml").write_text('part_of = "theirs.toml"\n', encoding="utf-8")
     write_table(folder, read_table(folder) | {"body": {"model": "mine.toml"}})
-    return folder
+    return with_small_texture(folder)
 
 
 def test_a_run_with_a_model_of_ones_own_ends_in_a_scene(

@@ -9,6 +9,8 @@ import pytest
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
+from .conftest import with_small_texture
+
 NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply", "clouds/0003.ply", "skin/0003.ply")
 
 
@@ -16,8 +18,8 @@ NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sample recording."""
     folder = tmp_path_factory.mktemp("recordings") / "sample"
-    make_arm_take(folder, ArmTakeSettings(frames=6, width_px=512))
-    return folder
+    make_arm_take(folder, ArmTakeSettings(frames=4, width_px=256))
+    return with_small_texture(folder)
 
 
 def test_the_operator_gives_the_commands_numbers_and_a_scene(blender: ModuleType, take: Path, tmp_path: Path) -> None:

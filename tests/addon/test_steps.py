@@ -20,6 +20,8 @@ from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.writing import read_table, write_table
 
+from .conftest import with_small_texture
+
 NAME = "bl_ext.user_default.tricap.addon"
 QUICK = {"growing": {"spacing_px": 6}}
 Words = Callable[[], str]
@@ -30,7 +32,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Footage, cameras and clicks of an arm."""
     folder = tmp_path_factory.mktemp("recordings") / "arm"
     make_arm_take(folder, ArmTakeSettings(frames=3, width_px=512, interlaced="none"))
-    return folder
+    return with_small_texture(folder)
 
 
 @pytest.fixture
@@ -698,7 +700,7 @@ def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[st
     assert clip.frame_start == -2
     scene.tricap.views["C"].offset_frames, scene.tricap.interlaced = 0, "odd"
     assert blender.ops.tricap.reload_footage() == {"FINISHED"} and scene.tricap.views["C"].clip.frame_duration == 3
-    assert read_table(folder) == {**before, "interlaced": "odd", "settings": QUICK}
+    assert read_table(folder) == {**before, "interlaced": "odd", "settings": QUICK | before["settings"]}
 
 
 @pytest.fixture(scope="module")

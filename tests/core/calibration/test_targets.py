@@ -146,7 +146,7 @@ def test_reflections_alone_are_no_bar(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def bar_folder(tmp_path_factory: pytest.TempPathFactory):
-    waved = waved_bar(benchmark_cameras(), 70, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.05))
+    waved = waved_bar(benchmark_cameras(), 50, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.05))
     folder = tmp_path_factory.mktemp("bar")
     write_bar_folder(folder, waved, BarPictures(radius_m=0.015))
     return folder, waved
@@ -167,7 +167,7 @@ def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
     assert error_m(waved.cameras, estimated, waved.ends_m.reshape(-1, 3)) < 0.5e-3
 
 
-@pytest.mark.parametrize(("lines", "first"), [("odd", 0), ("both", 0), ("both", 1)])
+@pytest.mark.parametrize(("lines", "first"), [("odd", 0), pytest.param("both", 0, marks=pytest.mark.slow), ("both", 1)])
 def test_an_interlaced_bar(tmp_path: Path, lines: str, first: int) -> None:
     """The other field holds another instant: only the field's own rows may be used, of both fields each for its own frame."""
     waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
@@ -232,7 +232,7 @@ def test_refusals_are_one_sentence_and_leave_no_file(change: str, says: str, bar
 
 def test_a_bar_parallel_to_the_images_is_refused_by_the_command(tmp_path: Path, capsys) -> None:
     """From its pictures: the sentence says which motion is missing, and no file is left."""
-    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    waved = waved_bar(benchmark_cameras(), 20, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     d = (waved.ends_m[:, 0] - waved.ends_m[:, 1]) * [1, 1, 0]
     half = waved.length_m / 2 * d / np.linalg.norm(d, axis=1, keepdims=True)
     middle = waved.ends_m.mean(axis=1)

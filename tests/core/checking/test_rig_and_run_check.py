@@ -82,7 +82,7 @@ def finished(arm_recording: Callable[..., Path], tmp_path_factory: pytest.TempPa
     """A finished run of five frames, and the take that it was made of beside it."""
     folder = tmp_path_factory.mktemp("run")
     shutil.copytree(arm_recording(), folder / "take")
-    pipeline.run(folder / "take", folder / "out", {"growing": {"spacing_px": 6}}, frames=(0, 5))
+    pipeline.run(folder / "take", folder / "out", {"growing": {"spacing_px": 6}, "skin": {"texture_px": 64}}, frames=(0, 5))
     return folder
 
 

@@ -17,6 +17,7 @@ from tricap.core.foundation.lock import locked
 from tricap.core.surface import starts
 
 NOT_COMPARED = ("run.json", "report/report.html", "report/report.json")  # they tell seconds
+COARSE = ("--set", "growing.spacing_px=10", "--set", "growing.seed_spacing_px=20")
 Capture = pytest.CaptureFixture[str]
 
 
@@ -34,7 +35,7 @@ def take(plane_take: Path, tmp_path: Path) -> Path:
 
 
 def run(take: Path, out: Path) -> int:
-    return main.main(["run", str(take), "--out", str(out), "--quiet", "--set", "growing.spacing_px=6"])
+    return main.main(["run", str(take), "--out", str(out), "--quiet", *COARSE])
 
 
 def files(out: Path) -> dict[str, bytes]:

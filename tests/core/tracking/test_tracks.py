@@ -12,7 +12,8 @@ from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.tracking.step import TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, assemble
 
-FRAMES = 10
+FRAMES = 8
+COARSE = {"growing": {"spacing_px": 6}}
 
 
 def moving_plane(scenes: Any, frames: int, half_m: tuple[float, float] = (0.24, 0.18)) -> list[Any]:
@@ -34,10 +35,10 @@ def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np
 
 @pytest.mark.parametrize(("interlaced", "noise"), [("none", 1.0), ("odd", 1.0)])
 def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced: str, noise: float) -> None:
-    """Ten frames: no point is lost in the middle, none is false, and the drift is less than 0.3 px across the line of sight."""
+    """No point is lost in the middle, none is false, and the drift is less than 0.3 px across the line of sight."""
     bodies, rig = moving_plane(scenes, FRAMES), scenes.three_cameras()
     take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=noise, interlaced=interlaced)
-    measured = scenes.measure(take, tmp_path / "out")
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
     tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 25.0)
     error, on_it = errors(bodies, tracks, 0.035)
     assert on_it.sum() > 50 and np.array_equal(tracks.frames, np.arange(FRAMES))
@@ -58,7 +59,7 @@ def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: A
     """Points of one field are found in the other, half a line away: no jitter from field to field."""
     bodies = moving_plane(scenes, 4)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0, interlaced="both")
-    measured = scenes.measure(take, tmp_path / "out")
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
     assert [m.frame for m in measured] == list(range(4)) and [m.field.grid.rows.offset for m in measured] == [0, 1, 0, 1]
     tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 50.0)
     error, on_it = errors(bodies, tracks, 0.035)
@@ -75,7 +76,7 @@ def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
     """The mean over all points of velocity against the true one; its scatter is that of the positions."""
     bodies = moving_plane(scenes, 5)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
-    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
+    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out", COARSE)), 25.0)
     whole = tracks.visible.all(axis=0)
     assert whole.sum() > 60
     X = tracks.xyz_m[2, whole]
@@ -92,7 +93,7 @@ def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any
     plane = scenes.Body(half_m=(0.5, 0.18), R=rotation_from_vector(np.array([0.1, 0.15, 0.0])), t=np.array([-0.75, 0.0, 2.16]))
     bodies = [plane.moved(np.eye(3), [0.05 * i, 0.0, 0.0]) for i in range(6)]
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
-    measured = scenes.measure(take, tmp_path / "out")
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
     steps = scenes.track(take, tmp_path / "out", measured, {"tracking": {"regenerate_every": 2}})
     growth = [len(m.cloud.xyz_m) / len(measured[0].cloud.xyz_m) for m in measured]
     assert growth[4] > 1.4
@@ -111,7 +112,7 @@ def test_an_occluded_point_ends_with_a_reason(tmp_path: Path, scenes: Any) -> No
     plane = scenes.Body(half_m=(0.24, 0.18))
     hider = scenes.Body(half_m=(0.12, 0.3), t=np.array([0.15, 0.0, 1.8]), seed=5)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane], [plane], [plane, hider]], noise=1.0)
-    steps = scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out"), {"tracking": {"regenerate_every": 0}})
+    steps = scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out", COARSE), {"tracking": {"regenerate_every": 0}})
     x = dict(zip(steps[1].identity, steps[1].xyz_m[:, 0]))
     hidden = [i for i in steps[1].identity if x[i] > 0.10]
     assert len(hidden) > 20 and set(hidden) <= set(steps[2].ended)
@@ -127,7 +128,7 @@ def test_lost_points_resume_under_their_identity(tmp_path: Path, scenes: Any) ->
     bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
     shown = [[b, bar] if i == 2 else [b] for i, b in enumerate(bodies)]
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), shown, noise=1.0)
-    measured = scenes.measure(take, tmp_path / "out")
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
     regained = {}
     for wait in (5, 0):
         steps = scenes.track(take, tmp_path / "out", measured, {"tracking": {"regenerate_every": 0, "wait_frames": wait}})
@@ -166,7 +167,7 @@ def test_a_guide_carries_lost_points_longer_than_neighbours(tmp_path: Path, scen
     bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
     shown = [[b, bar] if i in (2, 3) else [b] for i, b in enumerate(bodies)]
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), shown, noise=1.0)
-    measured = scenes.measure(take, tmp_path / "out", {"growing": {"spacing_px": 6}})
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
     knobs, regained = {"tracking": {"regenerate_every": 0, "wait_frames": 1}}, {}
     for guide in (None, Traveller(bodies, True), Traveller(bodies, False)):
         steps = scenes.track(take, tmp_path / "out", measured, knobs, guide=guide)
@@ -216,7 +217,7 @@ def test_a_black_frame_is_bridged(tmp_path: Path, scenes: Any) -> None:
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
     black = cv2.imencode(".png", np.zeros((150, 200), np.uint8))[1].tobytes()
     (take / "C" / "0002.png").write_bytes(black)
-    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
+    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out", COARSE)), 25.0)
     seen = tracks.visible
     assert not seen[2].any() and (seen[1] & seen[3]).sum() > 0.8 * seen[1].sum()
     error, on_it = errors(bodies, tracks, 0.035)
