@@ -23,6 +23,7 @@ DEEPEST = 64  # records in each other
 MOST_OBJECTS = 5_000  # models, meshes, materials, …: whatever becomes a thing of Blender's
 MANY = ("AnimationCurve", "AnimationCurveNode", "Deformer", "NodeAttribute")  # are parts of others
 MOST_PATHS, STEPS = 1_000_000, 4  # along so many connections
+LAYER = "AnimationLayer"
 MOST_UNPACKED = 100_000_000  # bytes
 MOST_RATIO = 100  # times its size, for larger files
 PIECE = 1 << 20
@@ -39,7 +40,7 @@ def check_fbx(path: Path) -> None:
             if file.read(len(MAGIC)) == MAGIC:
                 walk = _Walk(file, path)
                 walk.all()
-                if _paths(walk.joined) > MOST_PATHS:
+                if max(_paths(walk.joined), _actions(walk.joined, walk.layers)) > MOST_PATHS:
                     raise InputError(f"{path} connects its objects in more than {MOST_PATHS} ways; export the rig alone.")
     except (OSError, ValueError, struct.error, zlib.error, RecursionError) as error:
         raise InputError(f"{path} is not an FBX file that can be read ({error}); it is damaged, export it again.") from error
@@ -53,6 +54,7 @@ class _Walk:
         self._size = path.stat().st_size
         self._unpacked = self._objects = 0
         self.joined: list[tuple[int, int]] = []  # the objects that are connected, by their numbers: child and parent
+        self.layers: set[int] = set()  # the numbers of the animation's layers
 
     def all(self) -> None:
         """Every record of the file."""
@@ -78,6 +80,8 @@ class _Walk:
         numbers = [found for _ in range(values) if (found := self._value(end)) is not None]
         if parent == "Connections" and len(numbers) > 1:
             self.joined.append((numbers[0], numbers[1]))
+        if name == LAYER:
+            self.layers.update(numbers[:1])
         while self._file.tell() < end and self._record(end, depth + 1, name):
             pass
         if self._file.tell() != end:
@@ -115,6 +119,18 @@ class _Walk:
         found = _unpacked_size(data, claimed) if packed else len(data)
         if found != claimed:
             raise ValueError("an array whose length is not as it claims")
+
+
+def _actions(joined: list[tuple[int, int]], layers: set[int]) -> int:
+    """How often an object would be animated: in every stack, by every layer of it, by every curve of that that is also connected to it."""
+    parents: dict[int, list[int]] = {}
+    for child, parent in joined:
+        parents.setdefault(child, []).append(parent)
+    total = 0
+    for above in parents.values():
+        stacks = [len(parents.get(parent, [])) for parent in above if parent in layers]
+        total += sum(stacks) * (len(above) - len(stacks))
+    return total
 
 
 def _paths(joined: list[tuple[int, int]]) -> int:

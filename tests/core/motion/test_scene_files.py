@@ -56,6 +56,12 @@ def test_objects_that_are_connected_in_millions_of_ways(tmp_path: Path) -> None:
     assert write_fbx(tmp_path / "a.fbx", objects, joined=every).stat().st_size < 1_000_000
     with pytest.raises(InputError, match="connects its objects in more than 1000000 ways"):
         check_fbx(tmp_path / "a.fbx")
+    stacks, layers, curves, bones = levels[:4]
+    layered = [record(b"AnimationLayer", [number(i), text(b"l\0\1AnimLayer"), text(b"")]) for i in layers]
+    pairs = [(i, j) for lower, upper in ((layers, stacks), (curves, layers), (curves, bones)) for i in lower for j in upper]
+    write_fbx(tmp_path / "c.fbx", [*layered, *(model(i) for i in (*stacks, *curves, *bones))], joined=pairs)
+    with pytest.raises(InputError, match="connects its objects in more than 1000000 ways"):
+        check_fbx(tmp_path / "c.fbx")
     chain = [(i, i - 1) for i in range(1, 4000)] + [(5000, i) for i in range(1, 4000)]
     check_fbx(write_fbx(tmp_path / "b.fbx", [model(i) for i in range(1, 4000)], joined=chain))
 
