@@ -15,7 +15,9 @@ from typing import Any
 from ...foundation import bounded
 from ...foundation.errors import InputError
 
-MOST_NODES = 10_000  # and instances, each of which becomes an object
+DEEPEST = 200  # nodes in each other
+MOST_NODES = 10_000  # and instances, each of which becomes an object, and shapes of meshes
+MOST_ANIMATED = 1_000_000  # nodes times animations: the importer looks for every node in every animation
 MOST_VALUES = 10_000_000  # of all accessors, as often as they are used
 VALUES_PER_BYTE = 20  # for larger files
 VALUES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -63,15 +65,41 @@ def check_gltf(path: Path) -> None:
     try:
         _check_files(path, table)
         nodes = table.get("nodes", [])
-        count = len(nodes) + sum(_instances(table, node) for node in nodes)
+        _check_tree(nodes)
+        count = len(nodes) + sum(_instances(table, node) for node in nodes) + _shapes(table)
+        animated = len(nodes) * len(table.get("animations", []))
         values = sum(_values(table, accessor) for accessor in _used(table)) + _decompressed(table)
         most = max(MOST_VALUES, VALUES_PER_BYTE * path.stat().st_size)
     except DAMAGE as error:
         raise unreadable(path, error) from error
     if count > MOST_NODES:
-        raise InputError(f"{path} has {count} nodes, more than {MOST_NODES}; export the rig alone.")
+        raise InputError(f"{path} has {count} nodes and shapes, more than {MOST_NODES}; export the rig alone.")
+    if animated > MOST_ANIMATED:
+        raise InputError(
+            f"{path} has {len(table['animations'])} animations of {len(nodes)} nodes; export the rig alone, or fewer animations."
+        )
     if values > most:
         raise InputError(f"{path} asks for {values} numbers, far more than it contains; it is damaged, export it again.")
+
+
+def _check_tree(nodes: list[dict[str, Any]]) -> None:
+    """Nodes must be trees (glTF 2.0, 5.25), not deeper than the importer can follow.
+
+    Raises:
+        ValueError: a node has several parents, is its own ancestor, or lies too deep.
+    """
+    children = [node.get("children", []) for node in nodes]
+    named = [child for one in children for child in one]
+    if any(not 0 <= child < len(nodes) for child in named):
+        raise ValueError("a node that is none")
+    if len(set(named)) < len(named):
+        raise ValueError("a node has two parents")
+    level, seen = list(set(range(len(nodes))) - set(named)), 0
+    for _ in range(DEEPEST):
+        seen += len(level)
+        level = [child for node in level for child in children[node]]
+    if seen < len(nodes):
+        raise ValueError(f"a node is in itself, or in more than {DEEPEST} others")
 
 
 def _check_files(path: Path, table: dict[str, Any]) -> None:
@@ -114,6 +142,11 @@ def _count(value: Any) -> int:
     if not isinstance(value, int) or value < 0:
         raise ValueError("a count that is none")
     return value
+
+
+def _shapes(table: dict[str, Any]) -> int:
+    """How many shape keys the meshes would get."""
+    return sum(len(primitive.get("targets", [])) for mesh in table.get("meshes", []) for primitive in mesh["primitives"])
 
 
 def _instances(table: dict[str, Any], node: dict[str, Any]) -> int:

@@ -48,6 +48,20 @@ def test_an_fbx_file_that_asks_for_more_than_it_contains(tmp_path: Path, objects
     assert time.process_time() - began < 2.0 and memory_mb()[1] - before < 200
 
 
+@pytest.mark.parametrize(
+    ("children", "said"),
+    [({0: [1, 1]}, "two parents"), ({0: [2], 1: [2]}, "two parents"), ({0: [1], 1: [0]}, "in itself"), ({1: [1]}, "in itself"),
+     ({i: [i + 1] for i in range(300)}, "in more than 200 others"), ({0: ["a"]}, "can be read"), ({0: [-1]}, "can be read")],
+)  # fmt: skip
+def test_nodes_that_are_no_trees(tmp_path: Path, children: dict[int, list[Any]], said: str) -> None:
+    count = max(*children, 1) + 2
+    nodes = [{"name": f"n{i}", "children": children.get(i, [])} for i in range(count)]
+    with pytest.raises(InputError, match=said):
+        check_gltf(write_gltf(tmp_path / "a.glb", nodes=nodes))
+    nodes = [{"name": f"n{i}", "children": [i + 1] if i < 150 else []} for i in range(151)]
+    check_gltf(write_gltf(tmp_path / "b.glb", nodes=nodes))
+
+
 def test_objects_that_are_connected_in_millions_of_ways(tmp_path: Path) -> None:
     """Curves in every layer, layers in every stack: the importer makes an action for each way. A character has one way for each bone."""
     levels = [range(40 * i + 1, 40 * i + 41) for i in range(5)]
@@ -92,7 +106,7 @@ MESHOPT = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 36, "byteStrid
     [
         ({"accessors": [{**FLOATS, "count": 20_000_000}]}, "asks for 60000000 numbers, far more than it contains"),
         ({"accessors": [{**FLOATS, "count": 1000}], "meshes": REUSED}, "asks for 12000000 numbers"),
-        ({"nodes": [{"name": "a"}] * (MOST_NODES + 1)}, "10001 nodes, more than 10000"),
+        ({"nodes": [{"name": "a"}] * (MOST_NODES + 1)}, "10001 nodes and shapes, more than 10000"),
         ({"nodes": [GPU], "accessors": [{**FLOATS, "count": 10**6}]}, "1000001 nodes"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 36, "extensions": MESHOPT}]}, "asks for 300000009 numbers"),
         ({"buffers": [{"byteLength": 36, "uri": "/dev/zero"}]}, "“/dev/zero”, which lies outside its folder"),
@@ -100,6 +114,11 @@ MESHOPT = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 36, "byteStrid
         ({"images": [{"uri": "%2E%2E/a.png"}]}, "outside its folder"),
         ({"buffers": [{"byteLength": 36, "uri": "file:///etc/hostname"}]}, "outside its folder"),
         ({"buffers": [{"byteLength": 36, "uri": "pipe"}]}, "is not a VRM or glTF file that can be read"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{}] * 20_000}]}]}, "20001 nodes and shapes"),
+        (
+            {"nodes": [{"name": "a"}] * 1000, "animations": [{"channels": [], "samplers": []}] * 1001},
+            "1001 animations of 1000 nodes",
+        ),
         ({"nodes": 7}, "is not a VRM or glTF file that can be read"),
         ({"accessors": [{**FLOATS, "count": -1}]}, "a count that is none"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 9}}]}]}, "is not a VRM or glTF"),
