@@ -76,6 +76,8 @@ def test_faults_of_the_system_are_sentences() -> None:
     said = sentence_of(OSError(36, "File name too long", "a" * 5000))
     assert said and "File name too long" in said and len(said) < 1600
     assert "memory" in str(sentence_of(MemoryError()))
+    assert "memory" in str(sentence_of(ImportError("/usr/lib/x.so: failed to map segment from shared object")))
+    assert sentence_of(ImportError("No module named 'x'")) is None
 
 
 def test_a_name_that_is_too_long_is_one_sentence(rig: Path) -> None:

@@ -6,6 +6,9 @@ One sentence and exit code 2 each, nothing that was finished is lost, and the sa
 import errno
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +18,8 @@ import pytest
 from tricap.core.cli import main
 from tricap.core.foundation.lock import locked
 from tricap.core.surface import starts
+
+from ...waiting import wait_until
 
 NOT_COMPARED = ("run.json", "report/report.html", "report/report.json")  # they tell seconds
 COARSE = ("--set", "growing.spacing_px=10", "--set", "growing.seed_spacing_px=20")
@@ -156,6 +161,22 @@ def test_a_second_run_in_the_same_folder(take: Path, tmp_path: Path, whole: dict
             assert main.main([*argv, str(take), "--out", str(tmp_path / "out")]) == 2
             assert f"Another run (process {os.getpid()} on" in said(capfd)
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of Unix")
+def test_a_run_that_is_halted_keeps_its_folder_and_goes_on(take: Path, tmp_path: Path, whole: dict[str, bytes], capfd: Capture) -> None:
+    """SIGSTOP, as by Ctrl-Z or a laptop's lid: no other run takes the folder over, and after SIGCONT the result is the same."""
+    first = tmp_path / "out" / "cache" / "surface" / "0000.npz"
+    line = [sys.executable, "-P", "-m", "tricap", "run", str(take), "--out", str(tmp_path / "out"), "--quiet", "--workers", "1", *COARSE]
+    with subprocess.Popen(line, stderr=subprocess.PIPE) as halted:
+        try:
+            wait_until(lambda: first.is_file() or halted.poll() is not None)
+            halted.send_signal(signal.SIGSTOP)
+            assert run(take, tmp_path / "out") == 2 and f"Another run (process {halted.pid} on" in said(capfd)
+        finally:
+            halted.send_signal(signal.SIGCONT)
+        assert halted.wait() == 0
+    assert files(tmp_path / "out") == whole
 
 
 def test_what_a_killed_run_left_half_written_is_cleared_away(take: Path, tmp_path: Path, whole: dict[str, bytes]) -> None:
