@@ -23,9 +23,8 @@ ADDON = "bl_ext.user_default.tricap.addon"
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("calibrate") / "bar"
-    cameras = tuple(camera.resized((384, 288)) for camera in benchmark_cameras())
-    waved = waved_bar(cameras, 40, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
-    write_bar_folder(folder, waved, BarPictures(radius_m=0.03))
+    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    write_bar_folder(folder, waved, BarPictures(radius_m=0.015))
     return folder
 
 

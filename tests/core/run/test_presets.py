@@ -41,7 +41,7 @@ def test_every_value_of_a_preset_differs_from_the_default_or_states_a_figure_of_
 def test_the_preset_is_a_key_of_the_take_and_an_option(plane_take: Path, tmp_path: Path) -> None:
     path = plane_take / "take.toml"
     asked = path.read_text().replace("fps =", 'preset = "published"\nfps =')
-    assert take_of_text(asked, path).settings == ASKED
+    assert take_of_text(asked, path).settings == ASKED | {"growing": {"spacing_px": 6}}  # those of the take
     with pytest.raises(InputError, match="sets `preset` twice"):
         take_of_text(asked + '[settings.method]\npreset = "default"\n', path)
     with open_run(plane_take, tmp_path / "out", ASKED) as run:
