@@ -167,8 +167,9 @@ def test_a_second_run_in_the_same_folder(take: Path, tmp_path: Path, whole: dict
 def test_a_run_that_is_halted_keeps_its_folder_and_goes_on(take: Path, tmp_path: Path, whole: dict[str, bytes], capfd: Capture) -> None:
     """SIGSTOP, as by Ctrl-Z or a laptop's lid: no other run takes the folder over, and after SIGCONT the result is the same."""
     first = tmp_path / "out" / "cache" / "surface" / "0000.npz"
-    line = [sys.executable, "-P", "-m", "tricap", "run", str(take), "--out", str(tmp_path / "out"), "--quiet", "--workers", "1", *COARSE]
-    with subprocess.Popen(line, stderr=subprocess.PIPE) as halted:
+    arguments = ["run", str(take), "--out", str(tmp_path / "out"), "--quiet", "--workers", "1", *COARSE]
+    code = f"import sys; from tricap.core.cli import main; sys.exit(main.main({arguments!r}))"
+    with subprocess.Popen([sys.executable, "-P", "-c", code], stderr=subprocess.PIPE) as halted:
         try:
             wait_until(lambda: first.is_file() or halted.poll() is not None)
             halted.send_signal(signal.SIGSTOP)
