@@ -191,7 +191,7 @@ def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done:
     assert blender.ops.tricap.fit_again() == {"FINISHED"}
     after = read_joints(out / "joints.csv")
     shift = pull.cameras_of(scene)["C"].project(after.joints_m["wrist.R"][1]) - (at - (0.0, 8.0))
-    assert shift[1] > 0.02, "towards where it was dragged, against the images"
+    assert shift[1] > 3.0, "towards where it was dragged, against the images"
     assert all((out / name).read_bytes() == content for name, content in kept.items())
     motion = read_motion(out / "motion.csv", read_body(out / "body.toml").skeleton)
     values = motion.values[:, motion.dof_names.index("elbow.R flexion")]

@@ -10,7 +10,7 @@ import drive
 import numpy as np
 
 REVIEW, PULLED_PX, STAGE_S = "Tricap Review", 14.0, 180.0
-TOWARDS_PX = 0.03  # the wrist was right before, and the shape stays: the images outweigh the click
+TOWARDS_PX = 3.0  # of PULLED_PX: the wrist was right before, and the motion stays smooth
 FRAME = 2
 
 

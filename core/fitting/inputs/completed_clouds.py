@@ -6,6 +6,7 @@ Its points count inside the person's outline in all views, and where no measured
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ...foundation.progress import Monitor
@@ -20,6 +21,7 @@ from ..settings import FitSettings
 from .cloud_points import Cloud, tracked_clouds
 from .fit_input import BackgroundDistances
 
+EDGE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))  # cells at the outline: a person's depth there reaches over the background
 NEAR_M = 0.014  # a measured point so near is the better one
 
 
@@ -57,18 +59,19 @@ class CompletedClouds(Sequence[Cloud]):
         )
 
     def _of_the_person(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
-        """Whether points (N, 3) are inside the person's outline in all views in which the background is known."""
+        """Whether points (N, 3) are inside the person's outline, and not at it, in all views in which the background is known."""
         inside, known = np.ones(len(xyz_m), dtype=bool), False
         for view in self.background:
             distance = view.of_frame(frame)
             if distance is None:
                 continue
             known = True
+            within = cv2.erode((distance == 0).astype(np.uint8), EDGE, borderType=cv2.BORDER_CONSTANT, borderValue=1)
             at = np.floor((self.rig[view.view].project(xyz_m) + 0.5) / view.step_px)
             with np.errstate(invalid="ignore"):
                 visible = (at >= 0).all(axis=1) & (at < distance.shape[::-1]).all(axis=1)
             i, j = np.where(visible[:, None], at, 0).astype(int).T
-            inside &= visible & (distance[j, i] == 0)
+            inside &= visible & (within[j, i] > 0)
         return inside & known
 
 

@@ -1,8 +1,9 @@
 """Fit a few frames of a fitted body again, after joints were clicked in them: seconds instead of the minutes of a whole fit.
 
 The shape stays, and so do the limbs of which no joint was clicked. The frames around a click are adjusted together, with all observations
-of a whole fit; at both ends `HELD` frames keep their poses, so that the motion stays continuous. The adjustment starts from the earlier
-motion with the limbs led to the clicks, a change that fades out towards both ends.
+of a whole fit; the new clicks have a tenth of their usual sigma, so that the limb goes where it was pulled. At both ends `HELD` frames keep
+their poses, so that the motion stays continuous. The adjustment starts from the earlier motion with the limbs led to the clicks, a change
+that fades out towards both ends.
 
 The covariance of the shape is diagonal here, for body.toml has only its sigmas. A joint's sigma is divided by what the earlier fit found
 common to all frames:
@@ -42,6 +43,7 @@ from .sigma_parts import CLOTH_M, known
 REACH_S = 0.4  # from a click to the last frame that it may change
 HELD = 2  # frames at each end: accelerations tie three
 HELD_SIGMA = 1e-5  # rad, m
+PULLED = 0.1  # of the sigma of a click that was changed since the earlier fit
 STAGE = "fit around the clicks"
 
 
@@ -86,7 +88,7 @@ def fit_again(
     """
     wider = with_held(rows, len(earlier.frames))
     before, own = earlier.values[wider], range(rows.start - wider.start, rows.stop - wider.start)
-    part = _recording(given, earlier, settings, own, before, monitor)
+    part = _obeying(_recording(given, earlier, settings, own, before, monitor), joints)
     vector = part.fit.parameters.vector()
     limbs = limbs_with(part.fit.parameters, joints)
     problem = _held(whole_sequence(part), own, before)
@@ -134,6 +136,16 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         feet=standing(fit, before, body.vector(), given.time_s),
     )
     return whole.stretch(range(len(before)), before, body.vector())
+
+
+def _obeying(part: Recording, joints: Collection[str]) -> Recording:
+    """The same with clicks of some `joints` that outweigh the images: whoever pulls a joint has seen that these were misread."""
+    pulled = [part.fit.model.skeleton.joint_names.index(joint) for joint in joints]
+    clicked = {
+        t: replace(clicks, sigma_px=np.where(np.isin(clicks.joint, pulled), PULLED, 1.0) * clicks.sigma_px)
+        for t, clicks in part.fit.clicked.items()
+    }
+    return replace(part, fit=replace(part.fit, clicked=clicked))
 
 
 def _held(problem: Problem, own: range, before: np.ndarray) -> Problem:
