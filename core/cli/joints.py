@@ -27,11 +27,19 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError(f"Nothing was written. {start.question}")
     written = args.write and write_joints_as_clicks(footage.take.folder, start.frame, joints)
     if args.json:
-        table = {"frame": start.frame, "probability": start.probability, "rivals": dict(start.rivals), "ask": start.ask, "joints": joints}
+        table = {
+            "frame": start.frame,
+            "probability": start.probability,
+            "rivals": dict(start.rivals),
+            "ask": start.ask,
+            "unsure": list(start.unsure),
+            "joints": joints,
+        }
         return [json.dumps(table, indent=1)]
     rivals = ", ".join(f"{name} {p:.1%}" for name, p in start.rivals.items())
     lines = [f"Frame {start.frame}: {start.probability:.1%} certain" + (f" (otherwise: {rivals})." if rivals else ".")]
     lines += [f"{name:<12}" + "  ".join(f"{view} ({x:.1f}, {y:.1f})" for view, (x, y) in at.items()) for name, at in joints.items()]
+    lines += [f"Left to the other frames: {', '.join(start.unsure)}."] if start.unsure else []
     lines += [] if certain else [start.question]
     return [*lines, *([f"{footage.take.folder / 'take.toml'} has them as clicks."] if written else [])]
 

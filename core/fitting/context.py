@@ -65,6 +65,8 @@ class FitContext:
     silhouettes: Silhouettes
     background: BackgroundRegions
     collisions: CollisionPairs
+    found: tuple[str, ...] = ()  # joints that were found without clicks where the fit begins: bones between them have their own lengths
+    unsure: tuple[str, ...] = ()  # of these, joints of limbs that are not certain
     monitor: Monitor = field(default_factory=Monitor)  # checked for cancellation within the steps
 
     def stretch(self, frames: Sequence[int]) -> "FitContext":
@@ -156,6 +158,7 @@ class FitContext:
             s.length_sigma,
             s.proportion_sigma / root,
             self.stature_sigma / root,
+            self.found,
         )
 
     def shape_observations(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:

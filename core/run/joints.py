@@ -77,10 +77,10 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
 
 
 def pixels_of(footage: Footage, start: StartJoints) -> dict[str, dict[str, list[float]]]:
-    """The found joints that people click, in the pixels of the views that show them."""
+    """The found joints that people click, in the pixels of the views that show them; without those that are unsure."""
     found = dict[str, dict[str, list[float]]]()
     for name, xyz in start.xyz_m.items():
-        if name.partition(".")[0] in CLICKED:
+        if name.partition(".")[0] in CLICKED and name not in start.unsure:
             at = {c.name: c.project(xyz[None])[0] for c in footage.rig.cameras}
             found[name] = {view: np.round(xy, 1).tolist() for view, xy in at.items() if footage.rig[view].sees(xy)}
     return {name: at for name, at in found.items() if len(at) > 1}

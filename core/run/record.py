@@ -113,6 +113,7 @@ def start_figures(start: StartJoints) -> dict[str, Any]:
         "probability": round(start.probability, 4),
         "rivals": {name: round(p, 4) for name, p in start.rivals.items()},
         "stature": round(start.stature, 4),
+        "unsure": list(start.unsure),
         "joints_m": {name: np.round(xyz, 4).tolist() for name, xyz in start.xyz_m.items()},
     }
 

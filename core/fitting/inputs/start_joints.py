@@ -20,6 +20,7 @@ class StartJoints:
     probability: float
     rivals: Mapping[str, float]
     ask: str  # the joint whose click would decide
+    unsure: tuple[str, ...] = ()  # joints of arms that this frame does not show: the others decide where they are
 
     @staticmethod
     def sigma_m(joint: str) -> float:

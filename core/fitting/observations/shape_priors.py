@@ -19,6 +19,9 @@ the others, while clicked chains adapt by c_k. j_b ~ N(0, model.length_sigma²) 
 neck's base is placed anywhere between the breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck of fixed
 proportions above such a click lifts the skull off the measured head; with j_b its length follows from the head's surface.
 
+A person who was found without clicks has limbs of his own, too: bones between found joints differ by l + f_b, l ~ N(0, σ_l²) common to arms
+and legs, and f_b ~ N(0, σ_f²). Legs show their lengths; arms that are hidden in the first frame follow them, and not a wrong pose.
+
 (5), roundness: limbs are nearly round, trunks as flat as the model's, with its cross radii l_x⁰ and l_z⁰. Points from one side of a limb
 determine its depth and its thickness only together.
 
@@ -38,6 +41,7 @@ from ..state import BodyState, shape_vector
 
 STATURE_SIGMA = 0.07  # σ_g, relative, of a person about the model
 CLICK_ERROR_M = 0.02  # e of (4), of both ends of a length together
+LIMBS_SIGMA, FOUND_SIGMA = 0.10, 0.05  # σ_l and σ_f: of a person's limbs against the trunk, and of one of their bones
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,14 +144,20 @@ def proportions(
     clicked_sigma: float,
     own_sigma: float,
     stature_sigma: float = STATURE_SIGMA,
+    found: Sequence[str] = (),
 ) -> Proportions:
-    """(3) about the lengths (B,) of a model, with joints (J,) that were located: σ_c, σ_d and σ_g. Given lengths fix the size."""
+    """(3) about the lengths (B,) of a model, with joints (J,) that were located: σ_c, σ_d and σ_g. Given lengths fix the size.
+
+    `found`: joints that were found without clicks.
+    """
     stature = min(stature_sigma, clicked_sigma)
     of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)
     covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)  # (3)
     for chain in clicked_chains(model.skeleton, located):
         of_clicks = (CLICK_ERROR_M / lengths_m[chain].sum()) ** 2
         covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (4)
+    limbs = [b for b, bone in enumerate(model.skeleton.bones) if bone.head_joint in found and bone.tail_joint in found]
+    covariance[np.ix_(limbs, limbs)] += LIMBS_SIGMA**2 + FOUND_SIGMA**2 * np.eye(len(limbs))
     return Proportions(mean=np.log(lengths_m), covariance=covariance)
 
 

@@ -6,7 +6,8 @@ k are poses of the limb in frame t: those of the ways so far, kept and continued
 (Halton 1960), improved where they explain most (`explained.limb_gains`). X are the ends of the limb's bones, X̂_j those predicted from way j
 with damped velocity, σ grows with the time between the frames. The best `WAYS` poses that differ go on (beam search; Viterbi 1967). The
 trunk stays as it was tracked: it is large and hardly ever lost. What is seen of a limb later thus decides where it went before, and where
-nothing is seen of it, it moves evenly.
+nothing is seen of it, it moves evenly. A limb is followed from the frame where the fit begins, and stays there as it was found; one that is
+not certain there (`FitContext.unsure`) is followed from the first frame to the last, and may begin anywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...foundation.progress import Monitor
+from ..context import FitContext
 from ..explained import Evidence, limb_gains
 from ..limb import Limb, whole_limbs
 from .pose_tracking import PoseTracking, adjusted_alone
@@ -56,10 +58,10 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     if not fit.background.known:
         return motion
     changed = np.zeros(len(motion), dtype=bool)
-    ahead, back = list(range(fit.click, len(motion))), list(range(fit.click, -1, -1))
-    runs = [(limb, frames) for limb in whole_limbs(fit.parameters) for frames in (ahead, back) if len(frames) > 1]
-    for i, (limb, frames) in enumerate(runs):
-        for t, angles, ends in _best_way(given, motion, limb, frames, monitor.part(STAGE, i, len(runs) + 1)):
+    begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
+    runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]
+    for i, (limb, begin, frames) in enumerate(runs):
+        for t, angles, ends in _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs) + 1)):
             if np.linalg.norm(ends - limb.ends(motion[t][None], given.first.vector)[0], axis=1).max() > REPLACED_M:
                 motion[t, limb.columns] = angles
                 changed[t] = True
@@ -70,20 +72,38 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     return motion
 
 
+def _begin(fit: FitContext, limb: Limb) -> int | None:
+    """The frame index from which a limb is followed: where the fit begins, or for a limb that is not certain there, where it was clicked
+    next; None if it is certain nowhere."""
+    names = [fit.model.skeleton.bones[bone].tail_joint for bone in limb.bones.tolist()]
+    if not set(names) & set(fit.unsure):
+        return fit.click
+    rows = [fit.model.skeleton.joint_names.index(name) for name in names]
+    clicked = [t for t, clicks in fit.clicked.items() if np.isin(clicks.joint, rows).any()]
+    return min(clicked, key=lambda t: abs(t - fit.click), default=None)
+
+
+def _courses(begin: int | None, frames: int) -> list[list[int]]:
+    """The frames in the order in which a limb is followed: from where it begins, or from the first to the last."""
+    return [list(range(frames))] if begin is None else [list(range(begin, frames)), list(range(begin, -1, -1))]
+
+
 def _best_way(
-    given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], monitor: Monitor
+    given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """The frames after the first, with a limb's angles (C,) and the ends (E, 3) of its bones on its best way."""
+    """The frames with a limb's angles (C,) and the ends (E, 3) of its bones on its best way: without the first one, where it stays, or with
+    it if it may begin anywhere."""
     start, ends = motion[frames[0], limb.columns][None], limb.ends(motion[frames[0]][None], given.first.vector)
     none = np.zeros(1, dtype=np.intp)
     ways = [_Ways(angles=start, ends_m=ends, velocity_m_s=0 * ends, rate=0 * start, cost=np.zeros(1), before=none)]
-    for n, (s, t) in enumerate(zip(frames, frames[1:])):
+    steps = [(frames[0], frames[0]), *zip(frames, frames[1:])] if anywhere else [*zip(frames, frames[1:])]
+    for n, (s, t) in enumerate(steps):
         monitor.step(STAGE, n, len(frames))
         step_s = abs(float(given.time_s[t] - given.time_s[s]))
         near = given.fit.seen(t, given.points[t]).near(limb, given.state(motion[t]))
         ways.append(_continued(limb, ways[-1], motion[t], given.first.vector, near, step_s))
     k, found = int(np.argmin(ways[-1].cost)), list[tuple[int, np.ndarray, np.ndarray]]()
-    for t, way in zip(frames[:0:-1], ways[:0:-1]):
+    for (_, t), way in zip(steps[::-1], ways[:0:-1]):
         found.append((t, way.angles[k], way.ends_m[k]))
         k = int(way.before[k])
     return found
@@ -101,10 +121,11 @@ def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, ne
     tried = np.concatenate([going_on, best, *(limb.samples(a, IMPROVEMENTS, IMPROVED_RAD) for a in best)])
     poses = limb.poses(pose, tried)
     gain, ends = limb_gains(near, limb, poses, vector, FINE_M), limb.ends(poses, vector)
+    anew = step_s == 0  # the first frame of an unsure limb: any pose is as probable before it is seen
     expected = ways.ends_m + VELOCITY_KEPT * step_s * ways.velocity_m_s
     sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
     away = ((ends[:, None] - expected[None]) ** 2).sum(axis=(2, 3)) / (2 * sigma**2)
-    total = ways.cost[None] + np.minimum(away, LARGEST_JUMP)
+    total = ways.cost[None] + np.minimum(away, LARGEST_JUMP) * (not anew)
     before = np.argmin(total, axis=1)
     cost = total[np.arange(len(tried)), before] - gain / GAIN
     kept: list[int] = []
@@ -114,12 +135,12 @@ def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, ne
         if len(kept) == WAYS:
             break
     b = before[kept]
-    jumped = (away[kept, b] > LARGEST_JUMP)[:, None]
+    jumped = (anew | (away[kept, b] > LARGEST_JUMP))[:, None]
     return _Ways(
         angles=tried[kept],
         ends_m=ends[kept],
-        velocity_m_s=np.where(jumped[..., None], 0.0, (ends[kept] - ways.ends_m[b]) / step_s),
-        rate=np.where(jumped, 0.0, (tried[kept] - ways.angles[b]) / step_s),
+        velocity_m_s=np.where(jumped[..., None], 0.0, (ends[kept] - ways.ends_m[b]) / max(step_s, 1e-9)),
+        rate=np.where(jumped, 0.0, (tried[kept] - ways.angles[b]) / max(step_s, 1e-9)),
         cost=cost[kept] - cost[kept].min(),
         before=b,
     )

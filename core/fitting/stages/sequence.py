@@ -40,6 +40,7 @@ from ..smooth_radii import smooth_radii
 from ..solve.problem import Estimate, Problem, Scales, linearise, variance_factors
 from ..solve.solver import Solution, solve
 from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
+from ..start.taken_back import taken_back
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import ALTERNATION_STEPS, clicked_lengths, fit_click_frame
 from .contradicted import contradicted_frames, contradicted_joints
@@ -64,7 +65,7 @@ from .long_sequence import (
     sample,
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
-from .set_up import fit_context, with_start
+from .set_up import NeedsClick, fit_context, with_start
 from .sigma_parts import known, sigma_parts
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
@@ -88,7 +89,7 @@ def fit_sequence(
 
     Raises:
         InputError: the model or a degree of freedom is unknown, clicks contradict each other, it is not certain where the body starts
-            without more clicks, or the limb has no points where the fit begins.
+            without more clicks, the motion contradicts that start, or the limb has no points where the fit begins.
         Cancelled: the user asked to stop.
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
@@ -104,6 +105,8 @@ def fit_sequence(
     tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=tracks)
     motion, observed = track_poses(tracking, monitor, checkpoints)
     motion = follow_limbs(tracking, motion, monitor)
+    if given.start is not None and (contradicted := taken_back(fit, given.start, points, motion, first.vector, monitor)):
+        raise NeedsClick(contradicted.question)
     settings = replace(settings, model_patch_m=PATCH * settings.model_patch_m)
     fit = replace(fit, silhouettes=fit.silhouettes.drawn_only(), settings=settings)
     whole = Recording(

@@ -27,6 +27,7 @@ from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors,
 from .long_sequence import AT_ONCE
 
 FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
+FOUND = tuple(f"{joint}{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in (".L", ".R"))
 WHOLE = "full"  # the model that is looked for, whatever part of it is fitted
 
 
@@ -65,6 +66,8 @@ def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
     else:
         stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
     own = {"clicks": clicks, "click": begin, "priors": priors, "clicked": clicked, "places": places, "tracks": tracks}
+    if given.start is not None:
+        own |= {"found": FOUND, "unsure": given.start.unsure}
     where = np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), located)], axis=0)
     return context_of(given, settings, model, scaled_shape(shape, stature), stature_sigma=stature_sigma, located=where, **own)
 
@@ -145,6 +148,7 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
         clicked=clicked,
         places=places,
         tracks=JointTracks(given, names),
+        found=FOUND,
     )
     return find_start(replace(fit, monitor=monitor), points_of, given.frames, given.time_s, monitor, without)
 

@@ -29,12 +29,15 @@ from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
-from .limb_places import LimbPlaces, limb_places, limb_rivals
+from .limb_places import LimbPlaces, limb_places
 from .pose_dictionary import known_poses
 from .refine import (
+    EXCHANGES,
     LEAST_POINTS,
+    ROUNDS,
     STAGE,
     Explanation,
+    adjusted,
     carried,
     exchanged,
     missed_m,
@@ -48,24 +51,24 @@ from .search import hypotheses, is_inside
 
 LOOKED_AT = 24  # frames of which the easiest is searched, and of those around it
 OUTLINE = 3.0  # voxels, by ray of an outline
-AROUND_S = (0.06, 0.4)  # between two frames that are searched
+AROUND_S = (0.06, 0.25)  # between two frames that are searched
 SEARCHED = 3  # frames, at most
-FOLLOWED = 2  # explanations of a frame that are followed to the other
+FOLLOWED, LEAST_RIVAL = 2, 0.01  # explanations of a frame that are followed to the others: at most, and their least probability in it
 UNCONFIRMED = 0.1  # the probability that no explanation is right, unless both frames find the best one; each clicked joint halves it
 TRIED, DIFFERENT_M, AMONG = 5, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
-COMPLETED = 3  # of them, whose limbs are looked for
+COMPLETED = 2  # of them, which are adjusted to the end, and whose limbs are looked for
 SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
 FORWARD, MOST_FORWARD = 3.0, 1.0  # log odds per m/s of walking forwards, and at most
 WALK_S = 0.3  # before and after a frame, for the velocity
 UNTRIED = "a pose that was not among those tried"
 UNLIKELY = 0.01  # a less probable rival is not named
-JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # joints by which explanations are compared
+JUDGED = ("shoulder", "hip", "knee", "ankle")  # joints by which explanations are compared: of an arm all frames decide
+ASKED = (*JUDGED, "elbow", "wrist")  # joints that a person can click
+ARMS = ("elbow.L", "elbow.R")  # the first joints of limbs that all frames decide, not the first one
+LEAST_CERTAINTY = 0.9  # of an arm: below it is not certain in its frame
+ELSEWHERE = 0.5  # of a leg: one that is less certain in all frames is more probably elsewhere
 MISSED_M = 0.07  # from a click to its joint: the probability of the start falls by e^(-½) at this distance
-EXCHANGES = {
-    "front and back": ("hip", "knee", "ankle", "clavicle", "shoulder", "elbow", "wrist", "knuckles"),
-    "the left and the right leg": ("knee", "ankle"),
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,8 +128,11 @@ def find_start(
     clicked = {t: with_clicks(fit, thinned_points(points_of(t)), best.followed[0].at(t), last) for t in searched}
     limbs = {t: limb_places(fit, points_of(t), one, last) for t, one in clicked.items()}
     at = max(searched, key=lambda t: surely(limbs[t]))
+    arms = [limb for limb in limbs[at] if next(iter(limb.doubt)) in ARMS]
+    legs = [leg for leg in map(_surest, zip(*limbs.values())) if next(iter(leg.doubt)) not in ARMS and leg.certainty < ELSEWHERE]
     joints = np.unique(fit.clicked[at].joint) if at in fit.clicked else np.zeros(0, dtype=np.intp)
     doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(joints)
+    unsure = tuple(joint for arm in arms if arm.certainty < LEAST_CERTAINTY for joint in arm.doubt)
     final, stature = with_lengths(fit, thinned_points(points_of(at)), clicked[at], last)
     kept = (1 - doubt) * float(np.exp(-0.5 * (missed_m(fit, final) / MISSED_M) ** 2))
     explanations = [one.at(at) for one in best.followed]
@@ -138,9 +144,10 @@ def find_start(
         xyz_m=dict(zip(names, final.joints_m)),
         stature=stature,
         model=fit.model.name,
-        probability=kept * float(best.probability[0]) * surely(limbs[at]),
-        rivals=_with_limbs(rivals, limbs[at], kept * float(best.probability[0])),
-        ask=_least_sure(limbs[at], max(1 - kept, 1 - float(best.probability[0])), {names[j] for j in joints.tolist()})
+        unsure=unsure,
+        probability=kept * float(best.probability[0]) * surely(legs),
+        rivals=_with_limbs(rivals, legs, kept * float(best.probability[0])),
+        ask=_least_sure(legs, max(1 - kept, 1 - float(best.probability[0])), {names[j] for j in joints.tolist()})
         or _decisive(explanations, np.maximum(best.probability, 1 - kept), names, joints),
     )
 
@@ -216,23 +223,27 @@ def _explained(
     fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, velocity: np.ndarray, monitor: Monitor
 ) -> list[Explanation]:
     """The best explanations of frame index `t` that differ."""
-    evidence, thin = fit.seen(t, points), thinned_points(points)
+    evidence, thin, names = fit.seen(t, points), thinned_points(points), fit.model.skeleton.joint_names
     found = hypotheses(fit, t, evidence, known).best(AMONG)
     monitor.step(STAGE, 2, 10)
     tried: list[Explanation] = []
-    starts: list[np.ndarray] = []
+    starts: list[Explanation] = []
     for pose, stature in zip(found.poses, found.stature.tolist()):
-        joints = fit.parameters.state(pose, fit.parameters.vector()).joints_m
-        if len(tried) < TRIED and all(np.linalg.norm(joints - other, axis=1).max() > DIFFERENT_M for other in starts):
-            starts.append(joints)
-            tried.append(of_hypothesis(fit, t, thin, pose, stature, monitor.part(STAGE, 2 + len(starts), 20)))
+        start = of_hypothesis(fit, t, pose, stature)
+        if len(tried) < TRIED and all(difference_m(start, other, names).max() > DIFFERENT_M for other in starts):
+            starts.append(start)
+            tried.append(adjusted(fit, thin, start, ROUNDS[:1], monitor.part(STAGE, 2 + len(starts), 20)))
     tried.sort(key=lambda one: -one.score)
-    complete = [with_limbs(fit, thin, one, monitor.part(STAGE, 8 + i, 20)) for i, one in enumerate(tried[:COMPLETED])]
+    complete = [_complete(fit, thin, one, monitor.part(STAGE, 8 + i, 20)) for i, one in enumerate(tried[:COMPLETED])]
     best = max(complete, key=lambda one: one.score)
     rivals = [exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20)) for i, parts in enumerate(EXCHANGES.values())]
-    rivals += limb_rivals(fit, thin, best, monitor)
-    frame = judged(fit, [Followed(found=one) for one in (*tried[COMPLETED:], *complete, *rivals)], {t: velocity})
-    return [one.found for one in frame.followed[:FOLLOWED]]
+    frame = judged(fit, [Followed(found=one) for one in (*complete, *rivals)], {t: velocity})
+    return [one.found for one, p in zip(frame.followed[:FOLLOWED], frame.probability.tolist()) if p >= LEAST_RIVAL]
+
+
+def _complete(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:
+    """The explanation adjusted to the end, with its limbs."""
+    return with_limbs(fit, points, adjusted(fit, points, found, ROUNDS[1:], monitor), monitor)
 
 
 def judged(fit: FitContext, found: Sequence[Followed], velocity: Mapping[int, np.ndarray]) -> Judged:
@@ -306,6 +317,11 @@ def surely(limbs: Sequence[LimbPlaces]) -> float:
     return float(np.prod([limb.certainty for limb in limbs]))
 
 
+def _surest(of_frames: Sequence[LimbPlaces]) -> LimbPlaces:
+    """The places of one limb in the frame in which it is most certain."""
+    return max(of_frames, key=lambda limb: limb.certainty)
+
+
 def _with_limbs(rivals: Mapping[str, float], limbs: Sequence[LimbPlaces], probability: float) -> dict[str, float]:
     """The rivals with other places of single limbs, of an explanation with this probability; the more probable ones of the same name."""
     named = dict(rivals)
@@ -318,8 +334,10 @@ def _with_limbs(rivals: Mapping[str, float], limbs: Sequence[LimbPlaces], probab
 
 def _least_sure(limbs: Sequence[LimbPlaces], doubt: float, clicked: Set[str]) -> str | None:
     """The joint to click of the least certain limb; None if something else is doubted more, or all its joints are clicked."""
+    if not limbs:
+        return None
     least = min(limbs, key=lambda limb: limb.certainty)
-    joints = {joint: off for joint, off in least.doubt.items() if joint not in clicked and joint.partition(".")[0] in JUDGED}
+    joints = {joint: off for joint, off in least.doubt.items() if joint not in clicked and joint.partition(".")[0] in ASKED}
     return max(joints, key=lambda joint: joints[joint]) if joints and 1 - least.certainty > doubt else None
 
 

@@ -15,14 +15,13 @@ from ..context import FitContext
 from ..explained import limb_gains
 from ..inputs.cloud_points import CloudPoints
 from ..limb import Limb, whole_limbs
-from .refine import ROUNDS, Explanation, adjusted, explanation
+from .refine import Explanation
 from .search import click_penalty
 
 ANYWHERE, IMPROVED, AROUND, AROUND_RAD = 400, 6, 24, float(np.radians(15.0))  # poses of a limb: all around, the best, and around each
 BESIDE = ((48, AROUND_RAD), (100, float(np.radians(45.0))))  # poses around its own, within which angles
 NEAR_M, VOXELS_PER_NAT = 0.15, 20.0  # a limb so far from its place is wrong; g of (1)
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights of what they explain
-ELSEWHERE_M, ALMOST = 0.2, 80.0  # between the ends of a limb and of its rival, and how many voxels less the rival may explain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,15 +80,3 @@ def _click_penalty(fit: FitContext, t: int, limb: Limb, ends_m: np.ndarray) -> n
         for e, bone in enumerate(limb.bones.tolist()):
             penalty += click_penalty(fit.clicked[t], skeleton.joint_names.index(skeleton.bones[bone].tail_joint), ends_m[:, e])
     return penalty
-
-
-def limb_rivals(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> list[Explanation]:
-    """Rivals with one limb elsewhere, where it explains almost as much; adjusted in the same way."""
-    rivals = list[Explanation]()
-    for places in limb_places(fit, points, found, monitor):
-        elsewhere = places.off_m.max(axis=1) > ELSEWHERE_M
-        other = int(np.argmax(np.where(elsewhere, places.gain, -np.inf)))
-        if elsewhere[other] and places.gain[other] > places.gain[0] - ALMOST:
-            start = explanation(fit, found.t, points, places.poses[other], found.vector)
-            rivals.append(adjusted(fit, points, start, ROUNDS[-1:], monitor))
-    return rivals

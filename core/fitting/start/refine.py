@@ -21,9 +21,14 @@ from .search import click_penalty, scaled_vector
 
 REACH_M = 0.25  # of the points that take part, from the body
 ROUNDS = ((2.5, 6), (1.5, 6))  # gate_scale, steps
-FOLLOWING, STRIDE = ((1.5, 4),), 2  # the same where an explanation is followed through frames, and how many frames at a time
+FOLLOWING, STRIDE = ((1.5, 4),), 3  # the same where an explanation is followed through frames, and how many frames at a time
 LENGTH_STEPS = 8
+CLOSE = 250.0  # voxels less than the best: limbs of a rival that explains less are not looked for
 LEAST_POINTS, MOST_POINTS = 100, 700  # of a frame
+EXCHANGES = {
+    "front and back": ("hip", "knee", "ankle", "clavicle", "shoulder", "elbow", "wrist", "knuckles"),
+    "the left and the right leg": ("knee", "ankle"),
+}
 LEFT_OUT = ("toe", "crown")  # of an exchange: they depend on where the person faces
 SIGMA_M = 0.03  # of the joints of a rival
 STAGE = "find the person"
@@ -103,10 +108,18 @@ def with_limbs(fit: FitContext, points: CloudPoints, found: Explanation, monitor
     return best
 
 
-def exchanged(fit: FitContext, points: CloudPoints, found: Explanation, parts: Sequence[str], monitor: Monitor) -> Explanation:
+def exchanged(
+    fit: FitContext,
+    points: CloudPoints,
+    found: Explanation,
+    parts: Sequence[str],
+    monitor: Monitor,
+    close: float = CLOSE,
+) -> Explanation:
     """The rival with the sides of some joints (by their names without the side) exchanged, adjusted in the same way.
 
-    If hips and shoulders are among them, the person faces the other way.
+    If hips and shoulders are among them, the person faces the other way. Its limbs are looked for unless it explains less by
+    `close` [voxels] and more.
     """
     skeleton, names = fit.model.skeleton, list(fit.model.skeleton.joint_names)
     places = np.array(found.joints_m)
@@ -122,14 +135,15 @@ def exchanged(fit: FitContext, points: CloudPoints, found: Explanation, parts: S
     pose = inverse_kinematics(fit.parameters, clicks, fit.priors, fit.proportions).motion[0]
     pose[skeleton.locked] = found.pose[skeleton.locked]
     rival = adjusted(fit, points, explanation(fit, found.t, points, pose, found.vector), monitor=monitor)
-    return with_limbs(fit, points, rival, monitor)
+    return with_limbs(fit, points, rival, monitor) if found.score - rival.score < close else rival
 
 
 def with_lengths(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> tuple[Explanation, float]:
-    """Pose and bone lengths adjusted together, and the person's stature over the template's."""
+    """Pose and bone lengths adjusted together, and the stature over the template's, by bones that are no limb's."""
     near = adjusted(fit, points, found, ((1.5, LENGTH_STEPS),), monitor, "lengths")
     lengths = fit.parameters.layout.group("lengths")
-    return near, float(np.exp(np.mean(near.vector[lengths] - fit.parameters.vector()[lengths])))
+    of_trunk = [not {bone.head_joint, bone.tail_joint} <= set(fit.found) for bone in fit.model.skeleton.bones]
+    return near, float(np.exp(np.mean((near.vector[lengths] - fit.parameters.vector()[lengths])[of_trunk])))
 
 
 def with_clicks(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:
@@ -161,6 +175,7 @@ def missed_m(fit: FitContext, found: Explanation) -> float:
     return max(distance)
 
 
-def of_hypothesis(fit: FitContext, t: int, points: CloudPoints, pose: np.ndarray, stature: float, monitor: Monitor) -> Explanation:
-    """A hypothesis of the search, adjusted."""
-    return adjusted(fit, points, explanation(fit, t, points, pose, scaled_vector(fit.parameters, stature)), monitor=monitor)
+def of_hypothesis(fit: FitContext, t: int, pose: np.ndarray, stature: float) -> Explanation:
+    """A hypothesis of the search, not adjusted, and not judged yet."""
+    vector = scaled_vector(fit.parameters, stature)
+    return Explanation(t=t, pose=pose, vector=vector, score=-np.inf, joints_m=fit.parameters.state(pose, vector).joints_m)

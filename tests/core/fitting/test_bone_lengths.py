@@ -57,6 +57,17 @@ def test_what_nobody_clicked_follows_the_size_that_the_clicked_limbs_have(full) 
     assert 0.04 < sigma[at["head"]] < 0.06  # its own 4 %, and what is left open of the size
 
 
+def test_arms_of_somebody_who_was_not_clicked_follow_the_legs_and_not_the_trunk(full) -> None:
+    """Short legs are seen; arms that one frame hides are then short, too, and the trunk keeps its size."""
+    lengths, nobody = default_shape(full).lengths_m, np.zeros(len(full.skeleton.joint_names), dtype=bool)
+    prior = proportions(full, lengths, nobody, 0.15, 0.01, 0.01, found=[name for name in CLICKED if name not in ("neck", "head")])
+    at = {bone.name: b for b, bone in enumerate(full.skeleton.bones)}
+    change, sigma = _updated(prior, [at[f"{bone}.{side}"] for bone in ("thigh", "shin") for side in "LR"], -0.12)
+    assert -0.12 < change[at["forearm.R"]] < -0.09 and abs(change[at["spine"]]) < 0.01 and sigma[at["forearm.R"]] < 0.08
+    clicked = proportions(full, lengths, nobody, 0.15, 0.01, 0.01)
+    assert (np.diag(prior.covariance) > np.diag(clicked.covariance)).sum() == 8  # of limbs alone
+
+
 def test_one_clicked_bone_does_not_pull_the_others(full) -> None:
     at, prior = _prior(full)
     change, _ = _updated(prior, [at["forearm.R"]], -0.12)

@@ -1,6 +1,7 @@
 """What a pose explains of points and silhouettes, and the ways of limbs through frames in which nothing else holds them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.contradicted import ANYWHERE_M, CONTRADICTED, widened
 from tricap.core.fitting.stages.hidden_limbs import reacquired_poses
 from tricap.core.fitting.stages.limb_modes import elsewhere, of_joints
-from tricap.core.fitting.stages.limb_paths import follow_limbs
+from tricap.core.fitting.stages.limb_paths import _begin, _courses, follow_limbs
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.state import free_bones
@@ -159,6 +160,24 @@ def test_a_limb_that_tracking_lost_is_followed_through_the_frames(fit) -> None:
     true, now = (joint_positions(SHAPE.skeleton, SHAPE.lengths_m, m)["elbow.R"] for m in (POSES, motion))
     assert np.linalg.norm((now - true)[:, [0, 2]], axis=1).max() < 0.05 < np.linalg.norm((now[0] - true[-1])[[0, 2]])
     assert np.array_equal(follow_limbs(tracking, lost, Monitor()), motion)  # nothing is random
+
+
+def test_an_arm_that_is_not_certain_at_the_start_is_found_by_the_other_frames(fit) -> None:
+    first = Solution(motion=POSES[-1][None], vector=_vector(fit), cost=1.0, scales=Scales(), iterations=1, converged=True)
+    unsure = replace(fit, clicked={}, unsure=("elbow.R", "wrist.R"))
+    raised = np.tile(POSES[-1], (FRAMES, 1))  # in the first frame, too, where it hangs
+
+    def off(context) -> float:
+        tracking = PoseTracking(fit=context, points=[NOTHING] * FRAMES, time_s=np.arange(FRAMES) / 30, first=first, tracks=None)
+        motion = follow_limbs(tracking, raised, Monitor())
+        true, now = (joint_positions(SHAPE.skeleton, SHAPE.lengths_m, m)["elbow.R"] for m in (POSES[:1], motion[:1]))
+        return float(np.linalg.norm((now - true)[0, [0, 2]]))
+
+    assert off(unsure) < 0.05 < 0.15 < off(fit)
+    (arm,) = [limb for limb in whole_limbs(fit.parameters) if _begin(unsure, limb) is None]
+    assert _begin(fit, arm) == fit.click
+    clicks = SimpleNamespace(joint=np.array([SHAPE.skeleton.joint_names.index("wrist.R")]))
+    assert _begin(replace(unsure, clicked={3: clicks}), arm) == 3 and _courses(3, 5) == [[3, 4], [3, 2, 1, 0]]
 
 
 def test_nothing_is_followed_where_no_background_is_known(fit) -> None:

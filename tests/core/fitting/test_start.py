@@ -1,6 +1,7 @@
 """The start without clicks: the person is found, rivals get probabilities, and what is uncertain is asked."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,14 +16,14 @@ from tricap.core.fitting.inputs.start_joints import StartJoints
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages import set_up
 from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_start, with_start
-from tricap.core.fitting.start import find, search
+from tricap.core.fitting.start import find, search, taken_back
 from tricap.core.fitting.start.find import Followed, _decisive, _difference, _least_sure, _with_limbs, is_confirmed, judged, surely
 from tricap.core.fitting.start.limb_places import LimbPlaces, limb_places
 from tricap.core.fitting.start.pose_dictionary import known_poses
-from tricap.core.fitting.start.refine import Explanation, explanation, missed_m
+from tricap.core.fitting.start.refine import EXCHANGES, Explanation, explanation, missed_m
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
-from tricap.core.run.joints import write_joints_as_clicks
+from tricap.core.run.joints import pixels_of, write_joints_as_clicks
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 
@@ -163,6 +164,33 @@ def test_an_uncertain_start_is_not_used(monkeypatch) -> None:
     used = with_start(given, SETTINGS, Monitor())
     fit = set_up.fit_context(used, SETTINGS)
     assert fit.click == 0 and not fit.located.any() and np.allclose(fit.clicks.xyz_m, _joints(_pose(0.0)))
+    assert "wrist.L" in fit.found and not fit.unsure
+    hidden = replace(used, start=replace(start, unsure=("wrist.R",)))
+    assert set_up.fit_context(hidden, SETTINGS).unsure == ("wrist.R",)
+
+
+def test_a_motion_that_a_rival_explains_better_takes_its_start_back(monkeypatch) -> None:
+    points = [SimpleNamespace(xyz_m=np.zeros((200, 3)))] * 9
+    start = StartJoints(frame=0, xyz_m={}, stature=1.0, model="full", probability=0.99, rivals={}, ask="elbow.R")
+    monkeypatch.setattr(taken_back, "thinned_points", lambda one: one)
+    monkeypatch.setattr(taken_back, "explanation", lambda _fit, t, *_: _explained(np.zeros((1, 3)), 1000.0, t))
+    monkeypatch.setattr(taken_back, "adjusted", lambda _fit, _points, found, *_: found)
+    gain = dict.fromkeys(EXCHANGES.values(), -50.0)
+    monkeypatch.setattr(taken_back, "exchanged", lambda _fit, _p, found, parts, *_, **__: replace(found, score=found.score + gain[parts]))
+    judge = partial(taken_back.taken_back, None, start, points, np.zeros((9, 1)), np.zeros(1), Monitor())
+    assert judge() is None
+    gain[EXCHANGES["front and back"]] = 30.0
+    assert judge() is None  # 90 voxels in three frames
+    gain[EXCHANGES["front and back"]] = 60.0
+    assert "front and back. Click the right elbow" in judge().question
+
+
+def test_joints_that_are_left_to_other_frames_are_not_written_as_clicks() -> None:
+    joints = dict(zip(NAMES, _joints(_pose(0.0))))
+    start = StartJoints(frame=0, xyz_m=joints, stature=1.0, model="full", probability=0.99, rivals={}, ask="elbow.R", unsure=("wrist.R",))
+    footage = SimpleNamespace(rig=front_rig())
+    every, some = pixels_of(footage, replace(start, unsure=())), pixels_of(footage, start)
+    assert set(every) - set(some) == {"wrist.R"} and "wrist.L" in some
 
 
 def _explained(joints: np.ndarray, score: float, t: int = 0) -> Explanation:
