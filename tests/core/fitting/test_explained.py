@@ -205,7 +205,7 @@ def test_a_limb_that_explains_less_than_it_could_may_be_elsewhere(fit) -> None:
     sigmas = []
     for context, motion in ((fit, POSES), (fit, np.tile(BEFORE, (FRAMES, 1))), (bare, POSES)):
         at = Solution(motion=motion, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
-        found = elsewhere(context, [NOTHING] * FRAMES, at, time_s, range(3, FRAMES))
+        found = elsewhere(context, [NOTHING] * FRAMES, at, time_s, range(3, FRAMES), whole_limbs(fit.parameters))
         variance = of_joints(found, SHAPE.skeleton, FRAMES - 3)
         sigmas.append(dict(zip(SHAPE.skeleton.joint_names, np.sqrt(variance[-1]))))
         assert all(np.linalg.eigvalsh(one.covariance).min() > -1e-12 for one in found)

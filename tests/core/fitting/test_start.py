@@ -114,7 +114,7 @@ def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicke
     assert _least_sure(list(lost.values()), 0.1, {"elbow.R", "wrist.R"}) is None and _least_sure(list(lost.values()), 1.0, set()) is None
     assert _with_limbs({"where the right arm is": 0.01}, list(lost.values()), 0.8)["where the right arm is"] > 0.4
     clicks = {0: {"wrist.R": {c.name: c.project(joints["wrist.R"]) for c in front_rig().cameras}}}
-    assert _limbs(replace(bare, clicks=clicks), pose, monkeypatch)["elbow.R"].certainty > 0.9
+    assert _limbs(replace(bare, clicks=clicks), pose, monkeypatch)["elbow.R"].certainty > 0.7
 
 
 def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
