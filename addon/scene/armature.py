@@ -90,13 +90,13 @@ def channel_of(shape: BodyShape, stand: Standing | None = None) -> dict[str, Cha
 
 def rig_bones(shape: BodyShape) -> list[Bone]:
     """The bones of the skeleton that are bones of the armature: all but rigid connections without flesh (from the nape to the collarbone,
-    half the pelvis, from the wrist to the fingers), which no rig has. Fingers, too, have bones, which nothing moves but the animator."""
+    half the pelvis, from the wrist to the fingers), which no rig has. Fingers and toes have bones, which nothing moves but the animator."""
     skeleton, fleshy = shape.skeleton, set(shape.metaballs.bone_index.tolist())
     return [bone for b, bone in enumerate(skeleton.bones) if bone.dofs or not bone.parent or b in fleshy or is_finger(bone)]
 
 
 def is_finger(bone: Bone) -> bool:
-    """Whether it is a bone of a finger."""
+    """Whether it is a bone of a finger or of the toes."""
     return FINGER_BONE.fullmatch(bone.name) is not None
 
 

@@ -32,7 +32,7 @@ from ...geometry.rotation import cross
 from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
-from .hands import caged, rounded
+from .ends import caged, rounded
 from .mesh import SkinSettings, corner_uv, refined
 from .welding import cut, welded
 from .whole_surface import WholeSurface
@@ -223,22 +223,22 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     faces, uv, part = whole.faces, whole.uv, whole.part
     near = mean_of_neighbours(faces, len(whole.vertices_m))
     free = within(near, whole.sewn, SEAM_RINGS)
-    uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, part, surface), SEAM_RINGS))
+    coarse = _sparse(whole.vertices_m, faces, part, surface) & ~whole.end
+    uneven = np.setdiff1d(np.union1d(free, within(near, coarse, SEAM_RINGS)), np.flatnonzero(whole.end))
     vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
-    kept = 1 - np.maximum(loose, whole.hand)
-    seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
-    hand = whole.hand.astype(np.float64)
+    kept = 1 - np.maximum(loose, whole.end)
+    end = whole.end.astype(np.float64)
     for pieces in (settings.detail, detail):
         if pieces > 1:
-            columns = np.column_stack([weights, seam, 1 - kept, hand])
+            columns = np.column_stack([weights, 1 - kept, end])
             vertices, both, part, faces, uv = cut(vertices, columns, part, faces, uv, pieces)
-            weights, seam, kept, hand = strongest(both[:, :-3]), both[:, -3], 1 - both[:, -2], both[:, -1]
-            vertices = rounded(vertices, faces, hand > 0)
+            weights, kept, end = strongest(both[:, :-2]), 1 - both[:, -2], both[:, -1]
+            vertices = rounded(vertices, faces, end > 0)
     if detail * settings.detail > 1:
         rows = np.flatnonzero(kept)
         vertices[rows] += kept[rows, None] * (surface.projected(vertices[rows], part[rows], CUT_STEPS) - vertices[rows])
-    vertices = faired(unflipped(vertices, faces, seam > 0), faces, part, kept)
+    vertices = faired(unflipped(vertices, faces, np.ones(len(vertices), dtype=bool)), faces, part, kept)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names, pieces=detail)
 
 

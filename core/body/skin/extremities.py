@@ -145,6 +145,42 @@ def person_shape(shape: BodyShape) -> BodyShape:
     return replace(shape, metaballs=balls, radius_sigma_m=sigma, weight_sigma=None)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Placement:
+    """Where a template of an anatomical end is in its bone's axes: `scale` (3,) [m], x with the sign of its side, then `turn` (3, 3)."""
+
+    scale: np.ndarray
+    turn: np.ndarray
+
+    def in_bone(self, places: np.ndarray) -> np.ndarray:
+        """Positions [m] in the bone's axes of a template's places (…, 3)."""
+        return np.asarray((places * self.scale) @ self.turn)
+
+    def from_bone(self, xyz_m: np.ndarray) -> np.ndarray:
+        """The places (…, 3) of a template at positions [m] in the bone's axes."""
+        return np.asarray((xyz_m @ self.turn.T) / self.scale)
+
+
+def has_end(shape: BodyShape, b: int) -> bool:
+    """Whether bone b has the ellipsoids of an anatomical head, hand or foot (`person_shape`)."""
+    name = shape.skeleton.bones[b].name.removesuffix(".R").removesuffix(".L")
+    return name in TABLES and int((shape.metaballs.bone_index == b).sum()) == len(TABLES[name].balls)
+
+
+def placement(shape: BodyShape, b: int) -> Placement:
+    """The scale and the pitch with which the ellipsoids of bone b were placed. The bone `has_end`."""
+    name, balls = shape.skeleton.bones[b].name, np.flatnonzero(shape.metaballs.bone_index == b)
+    table = TABLES[name.removesuffix(".R").removesuffix(".L")].balls
+    half, at = (np.array([[getattr(e, f"{kind}{axis}") for axis in "xyz"] for e in table]) for kind in ("half_", ""))
+    scale = VISIBLE * shape.metaballs.radii_m[balls[0]] / half[0]
+    mine = shape.metaballs.centres_m(shape.lengths_m)[balls]
+    level, own = (c[:, 1] + 1j * c[:, 2] for c in (at * scale, mine))
+    pitch = np.angle((own * np.conj(level)).sum())  # the rotation that takes the table's places to the balls'
+    cosine, sine = np.cos(pitch), np.sin(pitch)
+    scale[0] *= -1.0 if name.endswith(".L") else 1.0
+    return Placement(scale, np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]))
+
+
 @lru_cache(maxsize=4)
 def shape_with_ends(shape: BodyShape, settings: SkinSettings) -> BodyShape:
     """The body of which contours with these settings are cast; its bones are those of the fit."""

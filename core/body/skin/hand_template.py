@@ -14,6 +14,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from .template import OWN, Template
+
 COLUMNS = 12  # vertices across the back of the hand, and across the palm
 RING = 2 * COLUMNS + 2
 AROUND = np.array([[0.78, -0.78], [0, -1], [-0.78, -0.78], [-1, 0], [-0.78, 0.78], [0, 1], [0.78, 0.78], [1, 0]])  # x, z of a finger's ring
@@ -34,7 +36,6 @@ KNUCKLE = (0.135, 0.150)  # half thickness at the knuckles: back, palm …
 BEYOND = (0.112, 0.122)  # … and between knuckles and webs
 FOLLOWING = (0.12, 0.5, 0.8, 0.97)  # to what degree the palm's last row, knuckles, the row beyond and webs follow the fingers
 NEAR_JOINT = 0.2  # weight of the bone beyond a joint in the rings beside it
-HAND = ""  # the name of the hand itself among `Template.bones`
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,18 +77,6 @@ class FingerFrames:
     axes: np.ndarray
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Template:
-    """The cage of a hand."""
-
-    vertices: np.ndarray  # (V, 3); the first RING are its border at the wrist: thumb's side, back, outer side, palm
-    faces: np.ndarray  # (F, 4) outside counter-clockwise
-    weights: np.ndarray  # (V, 16) of `bones`
-    bones: tuple[str, ...]
-    uv: np.ndarray  # (F, 4, 2) in units of length, from 0
-    uv_size: tuple[float, float]
-
-
 def finger_frames(finger: Finger) -> FingerFrames:
     """Where the bones of a finger are in the relaxed pose."""
     if finger is THUMB:
@@ -110,7 +99,7 @@ class _Cage:
     """The growing cage."""
 
     def __init__(self) -> None:
-        self.bones = (HAND, *(f"{finger.name}.0{k}" for finger in (THUMB, *FINGERS) for k in (1, 2, 3)))
+        self.bones = (OWN, *(f"{finger.name}.0{k}" for finger in (THUMB, *FINGERS) for k in (1, 2, 3)))
         self.places: list[np.ndarray] = []
         self.shares: list[np.ndarray] = []
         self.faces: list[np.ndarray] = []
@@ -317,6 +306,9 @@ def hand_template() -> Template:
         bones=cage.bones,
         uv=np.concatenate(cage.uv),
         uv_size=size,
+        ring=RING,
+        own=np.ones(len(places)),
+        column=np.arange(len(places)) % RING,
     )
 
 

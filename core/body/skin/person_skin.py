@@ -18,11 +18,10 @@ from ..shape import BodyShape
 from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
 from .fairing import anatomical, faired
-from .fingers import RIGID_HAND_BONE
+from .fingers import RIGID_BONE
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
-from .relief import SurfacePoints, measured_relief
-from .surface_operators import vertex_normals
+from .relief import SurfacePoints, directions, measured_relief
 from .welding import cut
 
 REST = "rest.npz"  # in the folder skin/
@@ -54,7 +53,7 @@ def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mi
         Cancelled: the monitor was cancelled.
     """
     relief = measured_relief(skin, shape, frames, mirror, monitor)
-    moved = skin.vertices_m + relief.displacement_m[:, None] * vertex_normals(skin.vertices_m, skin.faces)
+    moved = skin.vertices_m + relief.displacement_m[:, None] * directions(skin, shape)
     moved = unflipped(moved, skin.faces, np.ones(len(moved), dtype=bool))
     return replace(skin, vertices_m=moved, relief_m=relief.displacement_m, sigma_m=relief.sigma_m)
 
@@ -151,7 +150,8 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
     store.check_layout(path, arrays, **layout, **{name: ("f", "V") for name in measured})
     names, count = header.get("bone_names"), len(arrays["vertices_m"])
     bone_names = [bone.name for bone in shape.skeleton.bones]
-    if names not in (bone_names, [name for name in bone_names if not RIGID_HAND_BONE.fullmatch(name)]):  # the latter: with mittens
+    there = [name for name in bone_names if isinstance(names, list) and name in names]
+    if names != there or not all(RIGID_BONE.fullmatch(name) for name in {*bone_names} - {*there}):  # files without fingers or toes
         raise InputError(f"{path} has other bones than body.toml; run the fit again.")
     faces, bones, weights = arrays["faces"].astype(np.int64), arrays["bones"].astype(np.int64), arrays["weights"].astype(np.float64)
     pieces, rays = (n if isinstance(n := header.get(name), int) and n >= 0 else -1 for name in ("pieces", "rays"))
@@ -166,6 +166,7 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
     if not (inside and finite and (weights >= 0).all() and (weights.sum(axis=1) > 0).all()):
         raise InputError(f"{path} is damaged: its faces, weights or positions cannot be; run the fit again.")
     table = np.zeros((count, len(bone_names)))
+    bones = np.array([bone_names.index(name) for name in names])[bones]
     np.put_along_axis(table, bones, weights / weights.sum(axis=1, keepdims=True), axis=1)
     return OneSkin(
         vertices_m=arrays["vertices_m"],

@@ -34,7 +34,11 @@ class Poser:
 
     def posed(self, vertices_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Vertices (V, 3) in the pose (D,), rad and metres."""
-        return self.moved(vertices_m, *bone_frames(self._shape.skeleton, self._shape.lengths_m, np.asarray(pose, dtype=np.float64)))[0]
+        return self.moved(vertices_m, *self.frames(pose))[0]
+
+    def frames(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The bones' axes (B, 3, 3) and heads (B, 3) in the pose (D,), for `moved`."""
+        return bone_frames(self._shape.skeleton, self._shape.lengths_m, np.asarray(pose, dtype=np.float64))
 
     def moved(self, vertices_m: np.ndarray, R: np.ndarray, head: np.ndarray, normals: np.ndarray | None = None) -> list[np.ndarray]:
         """Vertices, and normals if given, for bones with the frames R (B, 3, 3) and heads (B, 3)."""

@@ -12,6 +12,9 @@ displacement δ of the vertex, which has a Gaussian Markov prior of the Matérn 
     Σ ρ( (δ_v − d)/σ ) + δᵀ Q δ → min ,   Q = (κ²M − C) M⁻¹ (κ²M − C) / τ² ,   τ² = 4π κ² s²                (2)
     σ² = σ_d² + c² σ_f² ,   σ_f: mean absolute deviation of the frames' d from δ nearby, √(π/2) times        (3)
 
+At head, hands and feet, whose shapes are anatomical, s is smaller and n is the normal of the surface without nose, ears and toes: along
+their own normals a coarse measurement would fold them.
+
 c > 1, because the errors of a frame are alike in all points of a region, so that many points of few frames prove little. Thus the skin is
 detailed where the frames agree (a face), and smooth where they do not (a bending hip).
 
@@ -32,6 +35,8 @@ from ...foundation.threads import in_threads
 from ...geometry.robust import TUKEY, mad_sigma
 from ..shape import BodyShape
 from .closed_skin import OneSkin
+from .ends import HEAD
+from .fairing import anatomical
 from .fingers import FINGER_BONE
 from .posed import Poser
 from .surface_operators import factorised, laplacian, vertex_normals
@@ -40,6 +45,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 PRIOR_M = 0.010  # s of (2): how far a body of metaballs lies from a person …
+HEAD_PRIOR_M = 0.005  # … its head, which has a face of its own
 THIN_PRIOR_M = 0.003  # … and its hands and feet, whose own pose is hardly measured
 FINGERS_REACH = 4.0  # vertices that follow fingers by a quarter count as theirs
 KAPPA = 25.0  # κ of (2) [1/m]: a range of 11 cm
@@ -96,15 +102,16 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    poser, normals = Poser(shape, skin.weights), vertex_normals(skin.vertices_m, skin.faces)
+    poser, normals = Poser(shape, skin.weights), directions(skin, shape)
     size, fingers = _prior_sigma(shape, skin), _fingers(shape, skin)
-    gate = np.where(fingers < 0.5, GATE * size, 0.0)
+    gate = np.where(fingers < 0.5, GATE * np.maximum(size, PRIOR_M * _share(shape, skin, (HEAD,))), 0.0)
     prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
     delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
+    smoothed = anatomical(shape, skin.weights)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
         moved, found = skin.vertices_m + delta[:, None] * normals, list[_Observed]()
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-        observed = partial(_observed, poser, moved, skin.faces, delta, gate)
+        observed = partial(_observed, poser, moved, skin.faces, delta, gate, normals, smoothed)
         for i in range(0, len(chosen), TOGETHER):
             monitor.step("relief", done * len(chosen) + i, len(ROUNDS) * len(chosen) + 1)
             found += in_threads(observed, [frames[row] for row in chosen[i : i + TOGETHER]])
@@ -126,7 +133,11 @@ class _Nearby:
         from scipy import sparse
 
         C, area = laplacian(vertices, faces)
-        self._factor, self._count = factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area)
+        self._factor, self._count, self._area = factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area), area
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Smooth values (V, K)."""
+        return np.asarray(self._factor.solve(self._area[:, None] * values))
 
     def scatter(self, vertex: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """σ_f (V,) of (3) from residuals (M,) at vertices (M,), none of which counts more than GATE times their standard deviation."""
@@ -136,10 +147,30 @@ class _Nearby:
         return np.asarray(np.maximum(np.sqrt(np.pi / 2) * mean, LEAST_SIGMA_M))
 
 
+def directions(skin: OneSkin, shape: BodyShape) -> np.ndarray:
+    """(V, 3) along which a skin is displaced: its normals, at head, hands and feet those of the surface without nose, ears and toes."""
+    normals = vertex_normals(skin.vertices_m, skin.faces)
+    smooth = _Nearby(skin.vertices_m, skin.faces).mean(normals)
+    return _mixed(normals, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), anatomical(shape, skin.weights))
+
+
+def _mixed(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Unit vectors (V, 3) between a and b."""
+    found = a + share[:, None] * (b - a)
+    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))
+
+
 def _prior_sigma(shape: BodyShape, skin: OneSkin) -> np.ndarray:
     """s (V,) of (2)."""
-    thin = [bone.name.split(".")[0] in ("hand", "foot") for bone in shape.skeleton.bones]
-    return np.asarray(PRIOR_M * (THIN_PRIOR_M / PRIOR_M) ** np.minimum(1.0, skin.weights[:, thin].sum(axis=1) + _fingers(shape, skin)))
+    thin = np.minimum(1.0, _share(shape, skin, ("hand", "foot")) + _fingers(shape, skin))
+    head = _share(shape, skin, (HEAD,))
+    return np.asarray(PRIOR_M * (THIN_PRIOR_M / PRIOR_M) ** thin * (HEAD_PRIOR_M / PRIOR_M) ** head)
+
+
+def _share(shape: BodyShape, skin: OneSkin, names: tuple[str, ...]) -> np.ndarray:
+    """(V,) to what degree vertices belong to the bones of these names."""
+    chosen = [bone.name.split(".")[0] in names for bone in shape.skeleton.bones]
+    return np.asarray(skin.weights[:, chosen].sum(axis=1))
 
 
 def _fingers(shape: BodyShape, skin: OneSkin) -> np.ndarray:
@@ -157,12 +188,21 @@ def _prior(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray) -> "sparse
     return sparse.csc_matrix(sparse.diags(scale) @ (KAPPA**2 * sparse.diags(area) - C))
 
 
-def _observed(poser: Poser, moved: np.ndarray, faces: np.ndarray, delta: np.ndarray, gate: np.ndarray, points: SurfacePoints) -> _Observed:
+def _observed(
+    poser: Poser,
+    moved: np.ndarray,
+    faces: np.ndarray,
+    delta: np.ndarray,
+    gate: np.ndarray,
+    directions: np.ndarray,
+    smoothed: np.ndarray,
+    points: SurfacePoints,
+) -> _Observed:
     """(1) of one frame, averaged for every vertex; `delta` (V,) is the displacement that the skin `moved` has, `gate` (V,) the largest."""
     from scipy.spatial import cKDTree
 
-    posed = poser.posed(moved, points.motion)
-    normals = vertex_normals(posed, faces)
+    posed, along = poser.moved(moved, *poser.frames(points.motion), directions)
+    normals = _mixed(vertex_normals(posed, faces), along, smoothed)
     X, m = points.xyz_m, points.normals
     distance, near = cKDTree(posed).query(X, k=CANDIDATES, distance_upper_bound=float(gate.max()))
     near = np.minimum(near, len(posed) - 1)

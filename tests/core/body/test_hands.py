@@ -11,10 +11,10 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.closed_skin import OneSkin, flipped, one_skin
+from tricap.core.body.skin.ends import row_counts, row_of_quads
 from tricap.core.body.skin.extremities import person_shape, shape_with_ends
-from tricap.core.body.skin.fingers import FINGER_BONE, RIGID_HAND_BONE, shape_for_skin
+from tricap.core.body.skin.fingers import FINGER_BONE, RIGID_BONE, shape_for_skin
 from tricap.core.body.skin.hand_template import FINGERS, RING, THUMB, UNIT_MM, hand_template
-from tricap.core.body.skin.hands import row_counts, row_of_quads
 from tricap.core.body.skin.mesh import DETAIL, SkinSettings
 from tricap.core.body.skin.person_skin import REST, read_skin, write_skin
 from tricap.core.body.skin.posed import Poser
@@ -155,7 +155,7 @@ def test_files_with_and_without_fingers_are_read(tmp_path: Path) -> None:
     write_skin(tmp_path / "old.npz", mittens)  # as written before there were fingers
     read = read_skin(tmp_path / "old.npz", person())
     assert read.bone_names == tuple(names())
-    assert not read.weights[:, [bool(RIGID_HAND_BONE.fullmatch(name)) for name in names()]].any()
+    assert not read.weights[:, [bool(RIGID_BONE.fullmatch(name)) for name in names()]].any()
 
 
 def test_the_contours_of_the_report_have_the_bones_of_the_fit() -> None:

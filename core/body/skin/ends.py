@@ -1,9 +1,9 @@
-"""Hands of a skin: from the wrist on, the template's palm and fingers in the place of the limb's end, for every person of one topology.
+"""Head, hands and feet of a skin: templates in the place of the parts' ends, for every person of one topology.
 
-    a limb's rings up to WRIST of the hand's bone ── rows in which three edges become one, or one three, until RING are left
-      ──▶ the template's cage, scaled as the fitted hand (1 in extremities)                                                    (1)
+    a part's rings up to the neck, wrist or ankle ── rows in which three edges become one, or one three, until the template's are left
+      ──▶ the template's cage, placed and scaled as the fitted head, hand or foot (1 in extremities)                         (1)
 
-A row that takes n edges to n − 2k has k groups of four quads about two new vertices, evenly around the wrist. Where quads of a hand are
+A row that takes n edges to n − 2k has k groups of four quads about two new vertices, evenly around the ring. Where quads of an end are
 cut, their vertices are those of a Catmull–Clark subdivision: the cut is followed by
 
     x' = x + 4/n (x̄ − x) ,   x̄: the mean of the centres of the n quads at x                                                 (2)
@@ -11,21 +11,55 @@ cut, their vertices are those of a Catmull–Clark subdivision: the cut is follo
 (Warren & Weimer 2002, Subdivision Methods for Geometric Design, sec. 7.2; Stam 2001, CAGD 18(5)).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..shape import BodyShape
 from ..skeleton import bone_frames
-from .fingers import hand_scale, has_fingers
-from .hand_template import PALM, RING, Template, hand_template
+from .extremities import has_end, placement
+from .fingers import HAND, has_digits
+from .foot_template import foot_template
+from .hand_template import PALM, RING, hand_template
+from .head_template import head_template
 from .rays import smooth
+from .template import Template
 from .welding import Net, Welded, face_uv, net_faces
 
+HEAD = "head"
 WRIST = 0.15  # the last ring of the limb is before this fraction of the hand's bone
 WRIST_HALF = (0.315, 0.20)  # half width and half thickness of the limb's last ring for which the template is made …
-NEAR_WRIST = (0.7, 1.5)  # … bounds of what others have in its place
+NEAR_RING = (0.7, 1.5)  # … bounds of what others have in its place
 FADING = 0.6  # and the length over which they pass into the palm's
+NECK = -0.58  # the trunk's last ring is below this height over the head's bone
+ANKLE = -0.62  # the leg's last ring is above this depth over the foot's bone
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Kind:
+    """How a template is joined: the part's last ring has its middle before `before` along `along`; the border runs from the axis `start` to
+    `quarter`. `fitted`: the template's vertices for a ring (N, 3), in the template's coordinates."""
+
+    template: Callable[[], Template]
+    along: np.ndarray
+    before: float
+    start: np.ndarray
+    quarter: np.ndarray
+    fitted: Callable[[np.ndarray, Template], np.ndarray]
+
+
+def _kind_of(shape: BodyShape, b: int) -> _Kind | None:
+    """Of bone b; None: the surface of its balls is its end."""
+    x, y, z = np.eye(3)
+    name = shape.skeleton.bones[b].name
+    if name == HEAD and has_end(shape, b):
+        return _Kind(head_template, y, NECK, -z, -x, _border_fitted)
+    if not has_digits(shape, b):
+        return None
+    return (
+        _Kind(hand_template, y, WRIST, x, -z, _palm_fitted) if name[:-2] == HAND else _Kind(foot_template, z, ANKLE, x, y, _border_fitted)
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -38,20 +72,20 @@ class Cage:
     weights: np.ndarray
     part: np.ndarray
     sewn: np.ndarray  # (V,) bool, as in `Welded`
-    hand: np.ndarray  # (V,) bool: beyond the wrist
+    end: np.ndarray  # (V,) bool: of a template
 
 
 def caged(whole: Welded, shape: BodyShape) -> Cage:
-    """The quads of the nets, the hands in place of the ends of limbs that have one."""
+    """The quads of the nets, with templates in place of the ends of parts that have one."""
     R, head = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
     nets, ends = list(whole.nets), []
     for p, net in enumerate(whole.nets):
         last = int(whole.weights[net.poles[1]].argmax()) if net.poles[1] is not None else -1
-        if last >= 0 and has_fingers(shape, last):
-            along = (whole.vertices_m[net.rings].mean(axis=1) - head[last]) @ R[last, :, 1] / shape.lengths_m[last]
-            row = int(np.flatnonzero(along <= WRIST)[-1])
-            nets[p] = Net(rings=net.rings[: row + 1], poles=(net.poles[0], None), kept=net.kept[:row])
-            ends.append(_Hand(shape, whole, net.rings[row], p, last, R[last], head[last]))
+        kind = _kind_of(shape, last) if last >= 0 else None
+        if kind is not None:
+            end = _End(shape, whole, net, p, last, kind, R[last], head[last])
+            nets[p] = Net(rings=net.rings[: end.row + 1], poles=(net.poles[0], None), kept=net.kept[: end.row])
+            ends.append(end)
     first, made = len(whole.vertices_m), []
     for end in ends:
         made.append(end.made(first))
@@ -64,16 +98,16 @@ def caged(whole: Welded, shape: BodyShape) -> Cage:
         weights=np.concatenate([whole.weights, *(m.weights for m in made)])[used],
         part=np.concatenate([whole.part, *(np.full(len(m.vertices_m), end.part) for end, m in zip(ends, made))])[used],
         sewn=np.concatenate([whole.sewn, np.zeros(first - len(whole.vertices_m), dtype=bool)])[used],
-        hand=np.arange(first)[used] >= len(whole.vertices_m),
+        end=np.arange(first)[used] >= len(whole.vertices_m),
         faces=numbers.reshape(-1, 4),
         uv=np.concatenate([uv, *(chart[0] + chart[1] * m.uv for chart, m in zip(charts, made))]),
     )
     return joined
 
 
-def _chart(end: "_Hand") -> tuple[float, float]:
-    """Width and height [m] of the texture's island of a hand."""
-    unit = float(np.abs(end.scale).mean())
+def _chart(end: "_End") -> tuple[float, float]:
+    """Width and height [m] of the texture's island of an end."""
+    unit = float(np.abs(end.placed.scale).mean())
     return unit * end.template.uv_size[0], unit * end.template.uv_size[1]
 
 
@@ -85,39 +119,44 @@ class _Made:
     uv: np.ndarray  # (F, 4, 2) 0…1
 
 
-class _Hand:
-    """One hand, sewn to the ring (N,) of a limb."""
+class _End:
+    """One end, sewn to a ring (N,) of a part."""
 
-    def __init__(self, shape: BodyShape, whole: Welded, ring: np.ndarray, part: int, b: int, R: np.ndarray, head: np.ndarray) -> None:
-        self.template, self.scale, self.part = hand_template(), hand_scale(shape, b), part
-        self._R, self._head, self._left = R, head, self.scale[0] < 0
-        local = (whole.vertices_m[ring] - head) @ R / self.scale
+    def __init__(self, shape: BodyShape, whole: Welded, net: Net, part: int, b: int, kind: _Kind, R: np.ndarray, head: np.ndarray) -> None:
+        self.template, self.part, self.placed = kind.template(), part, placement(shape, b)
+        self._R, self._head, self._left = R, head, self.placed.scale[0] < 0
+        rings = self.placed.from_bone((whole.vertices_m[net.rings] - head) @ R)
+        self.row = int(np.flatnonzero((rings.mean(axis=1) @ kind.along <= kind.before) & _beyond_holes(net))[-1])
+        ring, local = net.rings[self.row], rings[self.row]
         order = np.arange(len(ring))[::-1] if self._left else np.arange(len(ring))
-        angle = np.arctan2(-(local - local.mean(axis=0))[order, 2], (local - local.mean(axis=0))[order, 0])
+        spokes = (local - local.mean(axis=0))[order]
+        angle = np.arctan2(spokes @ kind.quarter, spokes @ kind.start)
         order = np.roll(order, -int(np.abs(angle).argmin()))
-        self._ring, self._local, self._places = ring[order], local[order], _fitted_to(local, self.template.vertices)
+        self._ring, self._local, self._places = ring[order], local[order], kind.fitted(local, self.template)
         names = [bone.name for bone in shape.skeleton.bones]
         side = shape.skeleton.bones[b].name[-2:]
         columns = [names.index(f"{name}{side}") if name else b for name in self.template.bones]
-        self._weights = np.zeros((len(self.template.vertices), len(names)))
-        self._weights[:, columns] = self.template.weights
         self._of_ring = whole.weights[self._ring]
+        own = np.zeros((len(self.template.vertices), len(names)))
+        own[:, columns] = self.template.weights
+        of_ring = _around(self._of_ring, self.template.ring)[self.template.column]
+        self._weights = of_ring + self.template.own[:, None] * (own - of_ring)
 
     def made(self, first: int) -> _Made:
-        """Vertices numbered from `first`, and the quads between them and the limb's ring."""
+        """Vertices numbered from `first`, and the quads between them and the part's ring."""
         t = self.template
         places, shares, faces = [self._places], [self._weights], [first + t.faces]
         uv = [t.uv / t.uv_size]
         ring, at, own = self._ring, self._local, self._of_ring
-        counts = row_counts(len(ring), RING)
+        counts = row_counts(len(ring), t.ring)
         count = first + len(t.vertices)
         for step, n in enumerate(counts, 1):
             share = step / len(counts)
             if step == len(counts):
-                upper, up_at, up_own = first + np.arange(RING), self._places[:RING], self._weights[:RING]
+                upper, up_at, up_own = first + np.arange(t.ring), self._places[: t.ring], self._weights[: t.ring]
             else:
-                up_at = (1 - share) * _around(self._local, n) + share * _around(self._places[:RING], n)
-                up_own = (1 - share) * _around(self._of_ring, n) + share * _around(self._weights[:RING], n)
+                up_at = (1 - share) * _around(self._local, n) + share * _around(self._places[: t.ring], n)
+                up_own = (1 - share) * _around(self._of_ring, n) + share * _around(self._weights[: t.ring], n)
                 upper = count + np.arange(n)
                 places.append(up_at)
                 shares.append(up_own)
@@ -136,14 +175,34 @@ class _Hand:
         found = np.concatenate(uv)
         if self._left:
             quads, found = quads[:, ::-1], found[:, ::-1]
-        vertices = self._head + (np.concatenate(places) * self.scale) @ self._R.T
+        vertices = self._head + self.placed.in_bone(np.concatenate(places)) @ self._R.T
         return _Made(vertices, quads, np.concatenate(shares), found)
 
 
-def _fitted_to(ring: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+def _beyond_holes(net: Net) -> np.ndarray:
+    """The rings (C,) between which and the end of the part no quad is missing."""
+    whole = net.kept.all(axis=1)
+    return np.append(np.logical_and.accumulate(whole[::-1])[::-1], True)
+
+
+def _middle_and_half(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return (points.max(axis=0) + points.min(axis=0)) / 2, np.ptp(points, axis=0) / 2
+
+
+def _border_fitted(ring: np.ndarray, template: Template) -> np.ndarray:
+    """The template's vertices, those near its border as wide and as deep as the part's last ring (N, 3) is, and in its middle."""
+    (to, wide), (at, own) = _middle_and_half(ring), _middle_and_half(template.vertices[: template.ring])
+    ratio, shift = np.clip(wide / np.maximum(own, 1e-9), *NEAR_RING), to - at
+    along = own.argmin()
+    ratio[along], shift[along] = 1.0, 0.0
+    return np.asarray(template.vertices + (1 - template.own[:, None]) * ((template.vertices - at) * (ratio - 1) + shift))
+
+
+def _palm_fitted(ring: np.ndarray, template: Template) -> np.ndarray:
     """The template's vertices, those of the palm as wide and as thick near the wrist as the limb's ring (N, 3) is."""
-    middle, half = (ring.max(axis=0) + ring.min(axis=0)) / 2, np.ptp(ring, axis=0) / 2
-    ratio = np.clip(half[[0, 2]] / WRIST_HALF, *NEAR_WRIST)
+    vertices = template.vertices
+    middle, half = _middle_and_half(ring)
+    ratio = np.clip(half[[0, 2]] / WRIST_HALF, *NEAR_RING)
     palm = vertices[: len(PALM) * RING]
     near = 1 - smooth((palm[:, 1] - WRIST) / FADING)[:, None]
     found = vertices.copy()
