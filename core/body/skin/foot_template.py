@@ -120,7 +120,7 @@ def _body() -> np.ndarray:
     for k in range(turning + len(AHEAD_MM)):
         angle = np.radians(RINGS_DEG[min(k, turning - 1)])
         down = np.array([0.0, -np.cos(angle), np.sin(angle)])  # from the pivot
-        half = HALF_MM[min(k, turning - 1)]
+        half: tuple[float, float] = HALF_MM[min(k, turning - 1)]
         centre = np.array([0.0, *PIVOT_MM]) + CENTRES_MM[min(k, turning - 1)] * down
         across, deep = np.cos(even), -np.sin(even)
         if k >= turning:
