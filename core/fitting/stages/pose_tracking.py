@@ -13,7 +13,6 @@ too. The predicted velocity of an occluded limb is damped by d, and its gate wid
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -36,7 +35,6 @@ LONGEST_PREDICTION = 5  # frames without a tracked pose; after more the predicti
 REACH_M = 0.20  # of the points that take part in one frame
 MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
 DAMPING = 0.7  # d of (1), of DOFs that nothing constrains, per frame
-WIDE_GATE, WIDE_STEPS = 2.5, 3  # of the first steps in a frame: the body may have gone further than its prediction
 GATE_GROWTH, LARGEST_GATE = 0.25, 4.0  # of the gate of an occluded limb: per frame, and the largest factor
 STAGE = "fit frame after frame"
 CHECKPOINT = "pose_tracking"
@@ -255,11 +253,11 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
 def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monitor: Monitor) -> tuple[np.ndarray, float, float]:
     """The pose (D,) adjusted from a start (D,), its support and its score."""
     fit, i, points, vector = given.fit, target.index, target.points, given.first.vector
-    prior = PosePrior(mean=start, sigma=_prediction_sigma(fit))
+    prior, cache = PosePrior(mean=start, sigma=_prediction_sigma(fit)), SegmentationCache()
 
-    def observe(gate: float, cache: SegmentationCache, t: int, state: BodyState) -> list[Observation]:
+    def observe(t: int, state: BodyState) -> list[Observation]:
         return [
-            *fit.surface_observations(i, points, state, gate * target.gate_scale, cache),
+            *fit.surface_observations(i, points, state, target.gate_scale, cache),
             *fit.joints(i),
             *fit.background.observe(i),
             *target.from_neighbour,
@@ -267,10 +265,8 @@ def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monito
             *fit.pose_observations(state),
         ]
 
-    now = Estimate(motion=start[None], vector=vector, scales=given.first.scales)
-    for gate, steps in ((WIDE_GATE, WIDE_STEPS), (1.0, fit.settings.frame_steps)):
-        now = replace(solve(fit.problem(partial(observe, gate, SegmentationCache())), now, steps=steps, monitor=monitor), scales=now.scales)
-    pose = now.motion[0]
+    begin = Estimate(motion=start[None], vector=vector, scales=given.first.scales)
+    pose = solve(fit.problem(observe), begin, steps=fit.settings.frame_steps, monitor=monitor).motion[0]
     return pose, fit.support(i, points, pose, vector), fit.score(i, points, pose, vector)
 
 
