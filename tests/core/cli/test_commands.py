@@ -409,7 +409,7 @@ def test_a_finished_run_is_not_computed_again(take: Path, tmp_path: Path, capfd:
     assert main.main(argv) == 0 and not computed and (out / "run.json").read_bytes() == before
     said = capfd.readouterr().out
     assert "Nothing has changed" in said and "2 frames" in said and "No body was fitted" in said
-    for more in (["--restart"], ["--pictures", "1"], ["--set", "growing.spacing_px=6"]):
+    for more in (["--restart"], ["--pictures", "1"], ["--set", "growing.spacing_px=5"]):
         shutil.copytree(out, tmp_path / "copy", dirs_exist_ok=True)
         main.main(["run", str(take), "--out", str(tmp_path / "copy"), "--frames", "0:2", *more, "--quiet"])
         assert computed.pop()
