@@ -157,7 +157,8 @@ def proportions(
         of_clicks = (CLICK_ERROR_M / lengths_m[chain].sum()) ** 2
         covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (4)
     limbs = [b for b, bone in enumerate(model.skeleton.bones) if bone.head_joint in found and bone.tail_joint in found]
-    covariance[np.ix_(limbs, limbs)] += LIMBS_SIGMA**2 + FOUND_SIGMA**2 * np.eye(len(limbs))
+    of_limbs: np.ndarray = LIMBS_SIGMA**2 + FOUND_SIGMA**2 * np.eye(len(limbs))
+    covariance[np.ix_(limbs, limbs)] += of_limbs
     return Proportions(mean=np.log(lengths_m), covariance=covariance)
 
 
