@@ -33,6 +33,7 @@ LARGEST_JUMP = 14.0
 VELOCITY_KEPT = 0.8
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights
 REPLACED_M = 0.05  # a tracked pose whose limb ends are nearer to the way stays
+LEAST_BETTER = 15.0  # voxels a frame by which a way must explain more than the tracked poses that it replaces
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,15 +62,39 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
     runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]
     for i, (limb, begin, frames) in enumerate(runs):
-        for t, angles, ends in _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs) + 1)):
-            if np.linalg.norm(ends - limb.ends(motion[t][None], given.first.vector)[0], axis=1).max() > REPLACED_M:
-                motion[t, limb.columns] = angles
-                changed[t] = True
+        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs) + 1))
+        for t, angles in _better(given, motion, limb, way).items():
+            motion[t, limb.columns] = angles
+            changed[t] = True
     again = monitor.part(STAGE, len(runs), len(runs) + 1)
     for t in np.flatnonzero(changed).tolist():
         again.step(STAGE, t, len(motion))
         motion[t] = adjusted_alone(given, t, motion[t], again)
     return motion
+
+
+def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: list[tuple[int, np.ndarray, np.ndarray]]) -> dict[int, np.ndarray]:
+    """The limb's angles (C,) by frame, where its way differs from a motion (T, D) and explains more, stretch after stretch.
+
+    Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it.
+    """
+    angles, vector = {t: a for t, a, _ in way}, given.first.vector
+    apart = [t for t, _, ends in way if np.linalg.norm(ends - limb.ends(motion[t][None], vector)[0], axis=1).max() > REPLACED_M]
+    found = dict[int, np.ndarray]()
+    frames = np.array(sorted(apart), dtype=np.intp)
+    for stretch in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
+        gain = [_gain_by_way(given, int(t), motion[t], limb, angles[int(t)]) for t in stretch]
+        if gain and float(np.mean(gain)) > LEAST_BETTER:
+            found.update({int(t): angles[int(t)] for t in stretch})
+    return found
+
+
+def _gain_by_way(given: PoseTracking, t: int, pose: np.ndarray, limb: Limb, angles: np.ndarray) -> float:
+    """How much more a limb explains with other angles (C,) than in a pose (D,) of frame index `t`, in voxels."""
+    near = given.fit.seen(t, given.points[t]).near(limb, given.state(pose))
+    poses = limb.poses(pose, np.stack([pose[limb.columns], angles]))
+    before, by_way = limb_gains(near, limb, poses, given.first.vector, FINE_M)
+    return float(by_way - before)
 
 
 def _begin(fit: FitContext, limb: Limb) -> int | None:
