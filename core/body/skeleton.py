@@ -245,7 +245,7 @@ def frames_of_bones(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarra
     What all poses have in common is computed once, and other bones than these and those that carry them are left out.
     """
     n = len(skeleton.base_dofs)
-    varies, turns = (motion != motion[:1]).any(axis=0), _turns(skeleton, motion)
+    varies = (motion != motion[:1]).any(axis=0)
     base = motion[:, :n] if varies[:n].any() else motion[:1, :n]
     frames: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # of one pose where all are the same
     for b in np.flatnonzero(skeleton.ancestors[bones].any(axis=0)).tolist():
@@ -256,8 +256,8 @@ def frames_of_bones(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarra
             R, head = frames[p]
             frame = R @ skeleton.rest_to_parent[b]
             head = head + (lengths_m[p] * R[:, :, 1] if skeleton.starts_at_tail[b] else 0.0)
-        for dof, _ in skeleton.turn_order[b]:
-            frame = frame @ (turns[:, dof] if varies[dof] else turns[:1, dof])
+        for dof, axis in skeleton.turn_order[b]:
+            frame = _turned(frame, axis, motion[:, dof] if varies[dof] else motion[:1, dof])
         frames[b] = frame, head
     R, head = np.empty((len(motion), len(bones), 3, 3)), np.empty((len(motion), len(bones), 3))
     for i, b in enumerate(bones.tolist()):
@@ -300,6 +300,17 @@ def _forward(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarray) -> t
             frame = frame @ turns[..., dof, :, :]
         R[..., b, :, :] = frame
     return R, head, axes
+
+
+def _turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
+    """Frames (N or 1, 3, 3) turned about one of their axes by angles (N or 1,)."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    turned = np.empty((max(len(frame), len(angle)), 3, 3))
+    turned[:, :, axis] = frame[:, :, axis]
+    turned[:, :, i] = cos * frame[:, :, i] + sin * frame[:, :, j]
+    turned[:, :, j] = cos * frame[:, :, j] - sin * frame[:, :, i]
+    return turned
 
 
 def _turns(skeleton: Skeleton, motion: np.ndarray) -> np.ndarray:

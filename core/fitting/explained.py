@@ -199,6 +199,13 @@ class _Capsules:
             posed=posed[bones],
         )
 
+    def image(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Both ends (N, 2, K, 2) [px] in a view, and the metres of a pixel (N, K) float32 at the middles."""
+        ends = np.stack([self.first_m, self.first_m + self.length_m[:, None] * self.axis], axis=1)
+        depth = camera.to_camera(ends.mean(axis=1).reshape(-1, 3))[:, 2].reshape(ends.shape[0], -1)
+        metres = np.maximum(depth, 1e-6) / camera.focal_px
+        return camera.project(ends.reshape(-1, 3)).reshape(*ends.shape[:-1], 2), metres.astype(np.float32)
+
     def radius(self, k: int | np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """The radius of capsule k, or of several (K, 1), at fractions of its length."""
         return np.asarray(self.radii_m[k, 0] + (self.radii_m[k, 1] - self.radii_m[k, 0]) * fraction)
@@ -269,19 +276,18 @@ def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray,
 
 def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
     best = np.zeros((len(capsules.first_m), len(view.xy_px)), np.float32)
-    centre = view.xy_px.mean(axis=0) if len(view.xy_px) else np.zeros(2)
-    for k, length in enumerate(capsules.length_m.tolist()):
-        first = capsules.first_m[:, k]
-        last = first + length * capsules.axis[:, k]
-        a, b = view.camera.project(first), view.camera.project(last)
-        seen = (np.abs(np.hstack([a, b])) < LARGEST_PX).all(axis=1)
-        a, ab = (np.where(seen[:, None], v, 1.0).astype(np.float32) for v in (a - centre, b - a))
-        size = np.maximum(np.linalg.norm(ab, axis=1), 1e-6)
-        metres = np.maximum(view.camera.to_camera((first + last) / 2)[:, 2], 1e-6) / view.camera.focal_px
-        xy = (view.xy_px - centre).astype(np.float32)
-        along, distance = _from_axis(xy, a, ab / size[:, None], size)
-        gap = distance * metres[:, None].astype(np.float32) - capsules.radius(k, along / size[:, None])
-        np.maximum(best, seen[:, None] * _weight(np.maximum(gap, 0.0), width_m), out=best)
+    if not len(view.xy_px):
+        return best.sum(axis=1)
+    centre = view.xy_px.mean(axis=0)
+    ends_px, metres = capsules.image(view.camera)
+    visible = (np.abs(ends_px) < LARGEST_PX).all(axis=(1, 3))
+    a, ab = (np.where(visible[..., None], v, 1.0).astype(np.float32) for v in (ends_px[:, 0] - centre, ends_px[:, 1] - ends_px[:, 0]))
+    size = np.maximum(np.linalg.norm(ab, axis=-1), 1e-6)
+    xy = (view.xy_px - centre).astype(np.float32)
+    for k in range(len(capsules.length_m)):
+        along, distance = _from_axis(xy, a[:, k], ab[:, k] / size[:, k, None], size[:, k])
+        gap = distance * metres[:, k, None] - capsules.radius(k, along / size[:, k, None])
+        np.maximum(best, visible[:, k, None] * _weight(np.maximum(gap, 0.0), width_m), out=best)
     return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
 
 

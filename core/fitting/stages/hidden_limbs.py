@@ -83,4 +83,6 @@ def _search(evidence: Evidence, limb: Limb, now: np.ndarray, vector: np.ndarray,
         gain = limb_gains(evidence if k else evidence.thinned(), limb, tried, vector, width)
         order = np.argsort(-gain, kind="stable")[:most]
         best, gain = tried[order], gain[order]
+        if not k and order[0] == 0:  # nothing in the joints' range explains more than the present pose
+            return None
     return best[0] if gain[0] > have + least else None

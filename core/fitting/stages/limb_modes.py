@@ -32,6 +32,7 @@ MODES = 10  # that differ, of one frame
 DIFFERENT_M = 0.05  # between the ends of two poses
 FROM_OWN_M = 0.07  # … of one and the fitted one: nearer ones are in its surroundings
 LARGEST_JUMP = 8.0
+HOPELESS = 10.0  # ln of the probability ratio by which all other poses of a frame are less probable than the fitted one, to be left out
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,9 +72,13 @@ def elsewhere(
 def _modes(limb: Limb, near: Evidence, pose: np.ndarray, vector: np.ndarray) -> LimbModes:
     """The poses of one frame that differ, the fitted one first, the others from the best on."""
     own = pose[limb.columns][None]
-    tried = np.concatenate([limb.samples(own[0], AROUND, AROUND_RAD), limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
-    coarse = limb_gains(near.thinned(), limb, limb.poses(pose, tried), vector, COARSE_M)
-    best = tried[np.argsort(-coarse, kind="stable")]
+    tried = np.concatenate([own, limb.samples(own[0], AROUND, AROUND_RAD), limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
+    poses = limb.poses(pose, tried)
+    coarse, ends = limb_gains(near.thinned(), limb, poses, vector, COARSE_M), limb.ends(poses, vector)
+    far = np.linalg.norm(ends - ends[0], axis=2).max(axis=1) > FROM_OWN_M
+    if coarse[far].max(initial=-np.inf) < coarse[0] - HOPELESS * GAIN:
+        return LimbModes(angles=own, ends_m=ends[:1], gain=coarse[:1])
+    best = tried[1:][np.argsort(-coarse[1:], kind="stable")]
     more = [limb.samples(angles, IMPROVEMENTS, IMPROVED_RAD) for angles in best[:IMPROVED]]
     tried = np.concatenate([own, *more, best[: 4 * MODES]])
     poses = limb.poses(pose, tried)
