@@ -18,7 +18,7 @@ from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..explained import Evidence, limb_gains
 from ..limb import Limb, whole_limbs
-from .pose_tracking import PoseTracking, adjusted_alone
+from .pose_tracking import PoseTracking
 
 STAGE = "follow the limbs"
 WAYS = 8
@@ -58,18 +58,12 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     motion, fit = motion.copy(), given.fit
     if not fit.background.known:
         return motion
-    changed = np.zeros(len(motion), dtype=bool)
     begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
     runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]
     for i, (limb, begin, frames) in enumerate(runs):
-        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs) + 1))
+        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs)))
         for t, angles in _better(given, motion, limb, way).items():
             motion[t, limb.columns] = angles
-            changed[t] = True
-    again = monitor.part(STAGE, len(runs), len(runs) + 1)
-    for t in np.flatnonzero(changed).tolist():
-        again.step(STAGE, t, len(motion))
-        motion[t] = adjusted_alone(given, t, motion[t], again)
     return motion
 
 

@@ -270,11 +270,6 @@ def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monito
     return pose, fit.support(i, points, pose, vector), fit.score(i, points, pose, vector)
 
 
-def adjusted_alone(given: PoseTracking, t: int, start: np.ndarray, monitor: Monitor) -> np.ndarray:
-    """The pose (D,) of frame t adjusted from a start (D,), without its neighbours."""
-    return _adjusted(given, _alone(given, t, start), start, monitor)[0]
-
-
 def _alone(given: PoseTracking, t: int, start: np.ndarray) -> TargetPose:
     """Frame t without its neighbours, with the points that are near in a pose (D,)."""
     fit, state = given.fit, given.state(start)
