@@ -14,6 +14,7 @@ class Cause(StrEnum):
     COMBING = "combing"
     COVERAGE = "coverage"
     DARK = "dark"
+    FAR_APART = "far apart"
     FEW_CLICKS = "few clicks"
     FILES_MISSING = "files missing"
     FOREIGN_RIG = "foreign rig"

@@ -25,6 +25,7 @@ from .view_matches import PairMatches
 FOCAL = (0.4, 12.0)  # of the image's longer side: 103° and 5° of view
 OFF_CENTRE = 0.2  # of the image's longer side
 FAR_APART_M = 100.0  # longer than any hall
+WIDEST_DEG = 45.0  # between the axes of two views whose patches still look alike
 SAME_PLACE = 0.005  # of the longest base
 LARGE_SIGMA0_PX = 1.0
 POOR = "Poor"  # first word of a red verdict in a rig.toml that has no `light` yet
@@ -68,6 +69,25 @@ def geometry_findings(rig: Rig) -> list[Finding]:
                 )
             )
     return findings
+
+
+def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
+    """Views that look from too far apart for patches to be matched: those that a point needs besides the reference view."""
+    ahead = np.array([camera.R_cam_world[2] for camera in cameras])
+    degrees = np.degrees(np.arccos(np.clip(ahead @ ahead[reference], -1.0, 1.0)))
+    others = sorted((k for k in range(len(cameras)) if k != reference), key=lambda k: degrees[k])[: min(2, len(cameras) - 1)]
+    if degrees[others[-1]] <= WIDEST_DEG:
+        return []
+    nearest = " and ".join(f"{cameras[k].name} ({degrees[k]:.0f}°)" for k in others)
+    return [
+        doubtful(
+            Cause.FAR_APART,
+            f"The views that look most like the reference view {cameras[reference].name} are {nearest}. Texture can be matched up to about "
+            f"{WIDEST_DEG:.0f}°, so hardly any surface will be measured.",
+            "Place neighbouring cameras at most 30° apart. A body can be fitted to the person's outlines and clicked joints alone: set "
+            "fitting.use_surface=false.",
+        )
+    ]
 
 
 def unit_findings(rig: Rig) -> list[Finding]:

@@ -41,6 +41,7 @@ from .rig_check import (
     same_views,
     stale_finding,
     unit_findings,
+    wide_findings,
 )
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .timing import Film, TimeOffset, estimate_offsets
@@ -246,7 +247,9 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     names = tuple(v.name for v in footage.take.views)
     matching = from_table(MatchingSettings, footage.take.settings.get("matching", {}), "[matching]")
     film = Film(footage, survey(footage, monitor))
-    findings = [*geometry_findings(footage.rig), *picture_findings(film.survey, names), *rate_findings(footage)]
+    fitting = from_table(FitSettings, footage.take.settings.get("fitting", {}), "[fitting]")
+    wide = wide_findings(footage.rig.cameras, footage.take.reference) if fitting.use_surface else []
+    findings = [*geometry_findings(footage.rig), *wide, *picture_findings(film.survey, names), *rate_findings(footage)]
     pairs = film.matches()
     identical = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.checking.rig_check import check_rig
+from tricap.core.checking.findings import Cause
+from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
 from tricap.core.cli import main
 from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.motion.formats.ply import read_ply, write_cloud
 from tricap.core.run import pipeline
@@ -170,3 +172,15 @@ def test_a_fault_of_a_result_is_named(fault: Callable[[Path], None], finished: P
     sound = {f.sentence for f in check_run(finished / "out", Monitor()).findings}
     new = [f for f in check_run(tmp_path / "run" / "out", Monitor()).findings if f.sentence not in sound]
     assert RESULTS[fault] in {f.cause for f in new}, new
+
+
+def test_views_from_too_far_apart_are_found():
+    def turned(degrees: float) -> list[Camera]:
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return [CAMERAS[0], CAMERAS[1], replace(CAMERAS[2], R_cam_world=turn @ CAMERAS[1].R_cam_world)]
+
+    assert not wide_findings(CAMERAS, 1) and not wide_findings(turned(40), 1)
+    (found,) = wide_findings(turned(60), 1)
+    assert found.cause == Cause.FAR_APART and "(60°)" in found.sentence and "use_surface=false" in found.advice
+    assert not wide_findings([*turned(60), CAMERAS[0]], 1)  # two others are near enough

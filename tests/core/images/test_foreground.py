@@ -171,3 +171,11 @@ def test_the_noise_of_a_given_background_is_that_of_the_images_that_show_it(nois
     assert background is not None and (background.known == 1).all()
     assert background.noise == pytest.approx(max(0.3, noise), rel=0.35)
     assert given_background(WALL, dark, 4) is None
+
+
+def test_a_bright_person_before_a_background_without_noise() -> None:
+    """The probability of the background is then smaller than any number: its logarithm must not be taken."""
+    image = np.where(_ellipse(70), np.float32(255), np.float32(0))
+    background = CellBackground(grey=np.zeros(SIZE, np.float32), noise=0.02, known=np.ones(SIZE), cell_px=4)
+    with np.errstate(divide="raise", over="raise"):
+        assert _iou(person(background, image, NOBODY), _ellipse(70)) > 0.95
