@@ -180,19 +180,19 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             return {name: data[name] for name in data.files}
 
 
-def digest(*parts: bytes | str | Path) -> str:
+def digest(*parts: bytes | str | Path, largest: int = bounded.IMAGE_BYTES) -> str:
     """A short SHA-256 over bytes, texts and the contents of files.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: a file cannot be read, or is larger than `largest` bytes.
     """
     total = hashlib.sha256()
     for part in parts:
         try:
-            for piece in _file(part) if isinstance(part, Path) else _bytes(part.encode() if isinstance(part, str) else part):
+            for piece in _file(part, largest) if isinstance(part, Path) else _bytes(part.encode() if isinstance(part, str) else part):
                 total.update(piece)
         except OSError as error:
-            raise InputError(f"Cannot read {part!s}: {error.strerror or error}; put it back and run again.") from error
+            raise InputError(f"Cannot read {part!s}: {error.strerror or error}. Check it and run again.") from error
     return total.hexdigest()[:16]
 
 
@@ -201,9 +201,9 @@ def _bytes(data: bytes) -> Iterator[bytes]:
     yield data
 
 
-def _file(path: Path) -> Iterator[bytes]:
+def _file(path: Path, largest: int) -> Iterator[bytes]:
     """The size and the content of a file, in pieces."""
-    with bounded.opened(path, bounded.MOVIE_BYTES) as file:
+    with bounded.opened(path, largest) as file:
         yield os.fstat(file.fileno()).st_size.to_bytes(8, "little")
         while piece := file.read(1 << 20):
             yield piece

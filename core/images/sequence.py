@@ -233,10 +233,8 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         if not path.is_file():
             raise InputError(f"The movie {path} of view {view} is missing; correct `movie` in take.toml.")
         return Movie(path)
-    try:
-        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
-    except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
-        paths = ()
+    found = bounded.matching(folder, pattern)
+    paths = tuple(sorted((p for p in found if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
     if not paths:
         inside = pattern and (folder / pattern).is_dir()
         hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Correct `images` there."

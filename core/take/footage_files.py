@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..foundation import bounded
 from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, natural
 from .bar_file import bar_path
@@ -103,7 +104,7 @@ def copy_take(source: Path, folder: Path) -> None:
 
 def _in_folder(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """What lies directly in FOLDER of the files that these patterns name."""
-    return [path for pattern in patterns for path in sorted(folder.glob(Path(pattern).parts[0]))]
+    return [path for pattern in patterns for path in sorted(bounded.matching(folder, Path(pattern).parts[0]))]
 
 
 def find_moved(links: Mapping[str, Path], place: Path) -> dict[Path, Path]:

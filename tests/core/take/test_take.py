@@ -158,6 +158,7 @@ FAULTS = {
     "footage a number": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = 3\n'), "needs either `images`"),
     "footage at any depth twice": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = "**/a/**/*.png"\n'), "with more than one"),
     "masks at any depth twice": (text(views=VIEWS + 'masks = "**/**/*.png"\n'), "with more than one"),
+    "an endless pattern": (text(views=VIEWS.replace("L/*", "L/" + "[" * 50_000, 1)), "pattern of 5.* characters"),
     "keypoints at any depth twice": (text(more='[[keypoints]]\nfiles = "**/**/*.json"\nview = "C"\n'), "with more than one"),
     "body a word": (text(dict(body='"arm.R"')), "\\[body\\] of .* must be a table"),
     "model a number": (text(more="[body]\nmodel = 3\n"), "`model` under \\[body\\] of .* is 3"),
