@@ -72,14 +72,19 @@ def written(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"Cannot write {path}: {error.strerror or error}. Choose another folder or free some space.") from error
 
 
+def part_of(path: Path) -> Path:
+    """The temporary name, with the same ending, under which another program writes a file. Nobody can place a link there before."""
+    return path.with_name(f".{path.stem}.{os.urandom(4).hex()}.part{path.suffix}")
+
+
 def try_writing(path: Path) -> None:
     """Make the folder of a file that another program will write, and test that it can be written there.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written, or there is something of that name, also a link.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
+    os.close(os.open(path, NEW_FILE, 0o666))
     path.unlink()
 
 

@@ -5,6 +5,7 @@ it is decoded.
 """
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -172,7 +173,7 @@ class Movie:
             self._next += 1
         self._refuse_change(index)
         if self._sizes.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
-            raise InputError(MARKED.format(path=self._path, name=self._path.name))
+            raise InputError(MARKED.format(path=self._path, name=shlex.quote(self._path.name)))
         self._last = image
         return grey(image)
 
