@@ -1,5 +1,6 @@
 """What a user may want otherwise: exact skin, T-pose, fewer keys, colours, arrows, pictures."""
 
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -284,6 +285,16 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     skin_object = skin.add_skin(empty.context.scene.collection, body, shape, prepared=skin_at_rest("full"))
     assert skin_object.data.uv_layers and all(len(face.vertices) == 4 for face in skin_object.data.polygons)
     np.testing.assert_allclose(world_vertices(empty, skin_object), skin_at_rest("full").vertices_m, atol=2e-5)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_turntable_is_not_written_to_the_end_of_a_link(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.scene import preview
+
+    (tmp_path / "letter.txt").write_text("mine")
+    (tmp_path / ".t.part.mp4").symlink_to(tmp_path / "letter.txt")
+    preview._write_movie(tmp_path / "t.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    assert (tmp_path / "letter.txt").read_text() == "mine" and (tmp_path / "t.mp4").stat().st_size > 100
 
 
 @pytest.mark.slow
