@@ -195,12 +195,12 @@ def say(sentence: str) -> None:
     print(sentence, flush=True)
 
 
-def run(*command: object) -> int:
-    """Run a program of the environment in the repository; its exit code.
+def run(*command: object, **variables: str) -> int:
+    """Run a program of the environment in the repository, with these variables of the environment; its exit code.
 
     One thread for OpenBLAS: numpy 1.26's (Blender 4.5) waits busily in every small matrix, beside the threads that match.
     """
-    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
+    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, **variables}
     return subprocess.run([str(part) for part in command], cwd=ROOT, env=environment).returncode
 
 
@@ -219,12 +219,16 @@ def demo(out: str) -> int:
 def test(everything: bool, pytest_arguments: list[str]) -> int:
     """Lint, types and tests; without `--all` the slow tests are left out. A process per core, each file in one of them (`-n0`: in none).
 
+    Lint and types, on one core, run beside the tests and are shown after them. The tests start hundreds of Pythons, which without
+    bytecode would each compile the whole code; therefore it is written even where the user's variables forbid it.
     `-P`: a file of the repository's root that happens to be called numpy.py is no module.
     """
     selection = [] if everything or "-m" in pytest_arguments else ["-m", "not slow"]
     processes = ["-n", str(min(os.cpu_count() or 1, 4)), "--dist", "loadfile"]
-    linted = lint()
-    tested = run(venv_program("python"), "-P", "-m", "pytest", *processes, *selection, *pytest_arguments)
+    with subprocess.Popen([sys.executable, str(ROOT / "dev.py"), "lint"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as linting:
+        tested = run(venv_program("python"), "-P", "-m", "pytest", *processes, *selection, *pytest_arguments, PYTHONDONTWRITEBYTECODE="")
+        say(linting.communicate()[0].decode(errors="replace").strip())
+    linted = linting.returncode
     say(f"lint and types: {'failed' if linted else 'passed'}; tests: {'failed' if tested else 'passed'}")
     return linted or tested
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+PIECE = 8 << 20  # bytes
 MAGIC = b"Kaydara FBX Binary  \0\x1a\0"
 
 
@@ -22,8 +23,17 @@ def number(value: int) -> bytes:
 
 def zeros(count: int, claimed: int | None = None) -> bytes:
     """An array of doubles, compressed; `claimed`: the number that it pretends to have."""
-    data = zlib.compress(b"\0" * 8 * count, 9)
+    data = deflated_zeros(8 * count)
     return b"d" + struct.pack("<III", count if claimed is None else claimed, 1, len(data)) + data
+
+
+def deflated_zeros(size: int) -> bytes:
+    """So many zeros in zlib's format: one compressed piece again and again, for a gigabyte takes seconds to compress."""
+    piece, rest = (zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS) for _ in range(2))
+    again = piece.compress(bytes(PIECE)) + piece.flush(zlib.Z_FULL_FLUSH)
+    end = rest.compress(bytes(size % PIECE)) + rest.flush()
+    checksum = (size % 65521) << 16 | 1  # Adler-32
+    return b"\x78\xda" + size // PIECE * again + end + checksum.to_bytes(4, "big")
 
 
 def record(name: bytes, values: list[bytes], inner: list[Any] | None = None, claimed: int | None = None) -> list[Any]:

@@ -152,6 +152,16 @@ def links_may_lead_in_a_circle(name: str, source: str) -> list[str]:
     return [f"{name}:{line} calls {called}" for line, called in calls(source) if called.endswith(".resolve") and "__file__" not in called]
 
 
+def patterns_are_matched_in_one_place(name: str, source: str) -> list[str]:
+    """Patterns from outside are matched by bounded.matching: links in circles have no end of names for `Path.glob`."""
+    return [
+        f"{name}:{node.lineno} matches a pattern that is no literal"
+        for node in nodes_of(source)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("glob", "rglob", "iglob")
+        if name != "core/foundation/bounded.py" and not isinstance(node.args[-1], (ast.Constant, ast.JoinedStr))
+    ]
+
+
 def no_network(name: str, source: str) -> list[str]:
     """Nothing leaves the computer."""
     absolute = [(line, module[0]) for line, relative, module in imported(name, source) if not relative]
@@ -256,6 +266,7 @@ REJECTED: list[tuple[Rule, str, str]] = [
     (files_are_opened_in_one_place, "core/images/sequence.py", "image = cv2.imread(str(path))"),
     (files_are_opened_in_one_place, "core/take/take.py", "data = np.load(path, allow_pickle=False)"),
     (links_may_lead_in_a_circle, "core/take/take.py", "where = Path(folder).resolve()"),
+    (patterns_are_matched_in_one_place, "core/take/take.py", "paths = sorted(folder.glob(take.views[0].images))"),
     (no_network, "core/cli/main.py", "from urllib.request import urlopen"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept:\n    g()"),
@@ -287,6 +298,7 @@ ACCEPTED: list[tuple[Rule, str, str]] = [
     (files_carry_no_code, "core/foundation/store.py", "np.load(path, allow_pickle=False)"),
     (files_are_opened_in_one_place, "core/take/take.py", "text = bounded.text_of(path, bounded.TOML_BYTES)\njson.dumps(text)"),
     (links_may_lead_in_a_circle, "core/take/take.py", "where, here = bounded.real_path(folder), Path(__file__).resolve()"),
+    (patterns_are_matched_in_one_place, "core/take/take.py", "paths = bounded.matching(folder, pattern) or folder.glob('*.ply')"),
     (no_network, "core/cli/main.py", "import json"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
     (state_is_in_the_session, "addon/session.py", "known = []"),

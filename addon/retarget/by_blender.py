@@ -117,7 +117,7 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
         InputError: the exporter failed.
     """
     file = real_path(file)
-    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
+    part = store.part_of(file)
     try:
         store.try_writing(part)
         export(str(part))

@@ -202,7 +202,7 @@ def save_blend(path: Path) -> None:
     path = real_path(path)
     if path.suffix != ".blend":
         raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part.blend")
+    part = store.part_of(path)
     try:
         store.try_writing(part)
         with _relative_caches(path):

@@ -161,7 +161,7 @@ def _over(behind: np.ndarray, picture: np.ndarray, opacity: float) -> np.ndarray
 
 
 def _write_movie(path: Path, pictures: list[np.ndarray]) -> None:
-    part = path.with_name(f".{path.stem}.part.mp4")
+    part = store.part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         movie = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), TURN_FPS, pictures[0].shape[1::-1])

@@ -20,6 +20,7 @@ from ..foundation.settings import nearest_name
 from .metaballs import STATIONS
 from .skeleton import Bone, Dof, Skeleton
 
+MOST_PARTS = 16  # files of which a model is made, one from the other
 MODELS = Path(__file__).with_name("models")
 MIRROR = np.array([-1.0, 1.0, 1.0])
 LOCKED = radians(0.1)  # sigma of the prior of a locked DOF
@@ -84,6 +85,8 @@ def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
         path = _path(wanted, found[-1][0].parent if found else Path())
         if any(bounded.real_path(path) == bounded.real_path(other) for other, _ in found):
             raise InputError(f"The body model {found[0][0]} is made from itself, by way of “{wanted}”; correct `mirror_of` or `part_of`.")
+        if len(found) == MOST_PARTS:
+            raise InputError(f"The body model {found[0][0]} is made from more than {MOST_PARTS} others in a row; write fewer.")
         found.append((path, _table(path)))
         table = found[-1][1]
         wanted = table.get("mirror_of", table.get("part_of"))
@@ -94,6 +97,8 @@ def _path(name: Any, folder: Path) -> Path:
     if not isinstance(name, str | Path):
         raise InputError(f'A body model in {folder} is made from {name!r}; write the name of a model, such as "arm.R", or a .toml file.')
     if str(name).endswith(".toml"):
+        if folder != Path() and Path(name).name != str(name):
+            raise InputError(f"A body model in {folder} is made from “{name}”; the file must be in the same folder.")
         return folder / name
     if name not in model_names():
         raise InputError(f"There is no body model “{name}”.{nearest_name(str(name), model_names())}")

@@ -15,7 +15,7 @@ from ..body.model_file import read_model, with_limits
 from ..body.motion import BodyFit, BodyMotion
 from ..body.shape import BodyShape, read_body
 from ..fitting.inputs.fit_input import FitInput
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
@@ -92,7 +92,8 @@ def _same_inputs(run: Mapping[str, Any], folder: Path) -> list[Finding]:
     """Input files that have changed since the run. A take that no longer exists is not an error."""
     take = Path(str(run.get("take", "")))
     try:
-        present = {p.name: store.digest(p) for p in (take / Path(name).name for name in run["inputs"]) if p.is_file()}
+        files = [take / Path(name).name for name in run["inputs"]]
+        present = {p.name: store.digest(p, largest=bounded.TOML_BYTES) for p in files if p.is_file()}
     except (OSError, ValueError):  # an impossible path: from another system, or damaged
         return []
     changed = [name for name, digest in run["inputs"].items() if present.get(name, digest) != digest]

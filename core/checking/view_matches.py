@@ -59,9 +59,11 @@ def match_pair(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     forward = matcher.knnMatch(a.descriptors, b.descriptors, 2)
-    back = {m.queryIdx: m.trainIdx for m in matcher.match(b.descriptors, a.descriptors)}
-    matched = [(m.queryIdx, m.trainIdx) for m, n in forward if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
+    matched = [(m.queryIdx, m.trainIdx) for m, n in forward if m.distance < RATIO * n.distance]
     pairs = np.array(matched, dtype=int).reshape(-1, 2)
+    if len(pairs):
+        back = matcher.match(b.descriptors[pairs[:, 1]], a.descriptors)  # one for each, in the same order
+        pairs = pairs[[m.trainIdx for m in back] == pairs[:, 0]]
     return pairs[:, 0], pairs[:, 1]
 
 

@@ -43,7 +43,7 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     except Cancelled as stop:
         streams.write_line(f"tricap: {stop}", sys.stderr)
         return 130
-    except (InputError, OSError, MemoryError, ImportError, cv2.error) as error:
+    except (InputError, OSError, MemoryError, ImportError, RuntimeError, cv2.error) as error:
         reason = sentence_of(error)
         if reason is None:
             raise

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from ..foundation import store
+from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..report.pictures import png
 from ..report.point_pictures import paths_in_space, paths_over_footage
-from ..results.folder import Results, check_separate_folder
+from ..results.folder import Results, check_inside, check_separate_folder
 from ..run import take_run
 from ..run.settings import settings_of
 from ..take.footage import Footage, open_take
@@ -36,6 +37,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
     for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):
         check_separate_folder(folder, take.folder, (s.files()[0] for s in footage.sequences))
+        if folder != args.pictures:
+            check_inside(folder, real_path(args.pictures))
     footage = footage if frames is None else take_run.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame
     if first not in footage.frames:

@@ -29,6 +29,7 @@ ARRAYS_BYTES = 8 << 30  # PLY and our own .npz
 MOVIE_BYTES = 1 << 42  # decoded piece by piece
 
 MOST_KEY_PARTS = 32  # of a dotted TOML key, for whose parts tomllib needs quadratic time
+LONGEST_PATTERN = 1000  # characters of a pattern of files
 DEEPEST = 64  # tables and lists in each other
 TOO_DEEP = f"more than {DEEPEST} tables and lists in each other"
 WHOLE_BITS = 63  # of a whole number, as TOML has it
@@ -97,6 +98,31 @@ def check_file(path: Path, largest: int) -> None:
     """
     with opened(path, largest):
         pass
+
+
+def matching(folder: Path, pattern: str) -> list[Path]:
+    """What a pattern of files names in a folder; nothing where it is no pattern.
+
+    Every folder is searched once for each part of the pattern: two links to the folder itself give “*/*/*/*.png” sixteen names for it,
+    and twenty-five parts more names than anybody can wait for.
+    """
+    if len(pattern) > LONGEST_PATTERN:
+        return []
+    parts = Path(pattern).parts
+    folders = [folder]
+    try:
+        for part in parts[:-1]:
+            inside = sorted((path for outer in folders for path in outer.glob(part) if path.is_dir()), reverse=True)
+            folders = list({_identity(path): path for path in inside}.values())
+        return [path for outer in folders for path in outer.glob(parts[-1])]
+    except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
+        return []
+
+
+def _identity(path: Path) -> tuple[int, int] | Path:
+    """The same for all names of a folder."""
+    state = path.stat()
+    return (state.st_dev, state.st_ino) if state.st_ino else real_path(path)  # not every drive of Windows has numbers
 
 
 def bytes_of(path: Path, largest: int) -> bytes:

@@ -1,6 +1,7 @@
 """The error that a user can correct, and the sentence for faults of the computer. Any other exception is a bug."""
 
 NO_MEMORY = -4  # OpenCV's code
+NO_THREAD = "can't start new thread"  # what Python says where the limit of memory or of processes is reached
 NO_ROOM = ("failed to map segment", "Cannot allocate memory")  # what the system's loader says of a library for which there is no memory
 LONGEST = 1500  # characters of a message
 
@@ -24,6 +25,8 @@ def sentence_of(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.strerror:
         names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
         return str(InputError(f"Cannot use {names or 'a file'}: {error.strerror}. Check its name, its rights and its drive."))
+    if isinstance(error, RuntimeError) and NO_THREAD in str(error):
+        return "No further thread can be started. Close other programs, or raise the limits of memory and processes if there are some."
     no_room = isinstance(error, ImportError) and any(words in str(error) for words in NO_ROOM)
     if isinstance(error, MemoryError) or no_room or getattr(error, "code", None) == NO_MEMORY:
         return "There is not enough memory. Close other programs, raise the limit if there is one, or reduce the images or the settings."

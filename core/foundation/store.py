@@ -72,14 +72,19 @@ def written(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"Cannot write {path}: {error.strerror or error}. Choose another folder or free some space.") from error
 
 
+def part_of(path: Path) -> Path:
+    """The temporary name, with the same ending, under which another program writes a file. Nobody can place a link there before."""
+    return path.with_name(f".{path.stem}.{os.urandom(4).hex()}.part{path.suffix}")
+
+
 def try_writing(path: Path) -> None:
     """Make the folder of a file that another program will write, and test that it can be written there.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written, or there is something of that name, also a link.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
+    os.close(os.open(path, NEW_FILE, 0o666))
     path.unlink()
 
 
@@ -180,19 +185,19 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             return {name: data[name] for name in data.files}
 
 
-def digest(*parts: bytes | str | Path) -> str:
+def digest(*parts: bytes | str | Path, largest: int = bounded.IMAGE_BYTES) -> str:
     """A short SHA-256 over bytes, texts and the contents of files.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: a file cannot be read, or is larger than `largest` bytes.
     """
     total = hashlib.sha256()
     for part in parts:
         try:
-            for piece in _file(part) if isinstance(part, Path) else _bytes(part.encode() if isinstance(part, str) else part):
+            for piece in _file(part, largest) if isinstance(part, Path) else _bytes(part.encode() if isinstance(part, str) else part):
                 total.update(piece)
         except OSError as error:
-            raise InputError(f"Cannot read {part!s}: {error.strerror or error}; put it back and run again.") from error
+            raise InputError(f"Cannot read {part!s}: {error.strerror or error}. Check it and run again.") from error
     return total.hexdigest()[:16]
 
 
@@ -201,9 +206,9 @@ def _bytes(data: bytes) -> Iterator[bytes]:
     yield data
 
 
-def _file(path: Path) -> Iterator[bytes]:
+def _file(path: Path, largest: int) -> Iterator[bytes]:
     """The size and the content of a file, in pieces."""
-    with bounded.opened(path, bounded.MOVIE_BYTES) as file:
+    with bounded.opened(path, largest) as file:
         yield os.fstat(file.fileno()).st_size.to_bytes(8, "little")
         while piece := file.read(1 << 20):
             yield piece

@@ -16,6 +16,7 @@ from ..foundation.settings import nearest_name
 from .camera import Camera
 from .rotation import rotation_from_vector, vector_from_rotation
 
+LARGEST_NUMBER = 1e12  # of a calibration in any unit; beyond it, powers of it overflow
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
@@ -160,8 +161,9 @@ def _array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...] | None, la
         array = np.array(entry[key], dtype=np.float64)
     except (TypeError, ValueError):
         array = np.array(math.nan)
-    if (shape is not None and array.shape != shape) or not np.isfinite(array).all():
-        raise InputError(f"“{key}” of {label[0].lower() + label[1:]} must be {'x'.join(map(str, shape or ('n',)))} finite numbers.")
+    if (shape is not None and array.shape != shape) or not (np.abs(array) <= LARGEST_NUMBER).all():
+        count = "x".join(map(str, shape or ("n",)))
+        raise InputError(f"“{key}” of {label[0].lower() + label[1:]} must be {count} finite numbers, none beyond {LARGEST_NUMBER:.0e}.")
     return array
 
 

@@ -5,6 +5,7 @@ it is decoded.
 """
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -172,7 +173,7 @@ class Movie:
             self._next += 1
         self._refuse_change(index)
         if self._sizes.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
-            raise InputError(MARKED.format(path=self._path, name=self._path.name))
+            raise InputError(MARKED.format(path=self._path, name=shlex.quote(self._path.name)))
         self._last = image
         return grey(image)
 
@@ -233,10 +234,8 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         if not path.is_file():
             raise InputError(f"The movie {path} of view {view} is missing; correct `movie` in take.toml.")
         return Movie(path)
-    try:
-        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
-    except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
-        paths = ()
+    found = bounded.matching(folder, pattern)
+    paths = tuple(sorted((p for p in found if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
     if not paths:
         inside = pattern and (folder / pattern).is_dir()
         hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Correct `images` there."

@@ -42,6 +42,7 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
     size = sum(c.size_px[0] for c in cameras), max(c.size_px[1] for c in cameras) + BAR_PX
     part = results.path("cache", "film.mp4")
     part.parent.mkdir(parents=True, exist_ok=True)
+    part.unlink(missing_ok=True)  # OpenCV would write through a link, or over another name of a file
     movie = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*CODEC), footage.take.fps, (size[0] // 2 * 2, size[1] // 2 * 2))
     try:
         if not movie.isOpened():

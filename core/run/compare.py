@@ -18,7 +18,7 @@ from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median, mad_sigma
 from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page
-from ..results.folder import Results, check_separate_folder
+from ..results.folder import Results, check_inside, check_separate_folder
 from . import pipeline
 from .settings import Overrides
 from .take_run import open_run
@@ -33,10 +33,12 @@ def run_both(
     """Run both methods; the folders of their results, in the order of `METHODS`.
 
     Raises:
-        InputError: see `pipeline.run`; or the overrides choose a preset.
+        InputError: see `pipeline.run`; or the overrides choose a preset, or one of the folders is a link out of `out`.
         Cancelled: what is done is kept.
     """
     check_separate_folder(out)
+    for method in METHODS:
+        check_inside(real_path(out) / method, real_path(out))
     if "preset" in overrides.get("method", {}):
         raise InputError("A comparison runs both presets; leave out --preset.")
     for method in METHODS:

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..body.model_file import model_files
 from ..fitting.settings import ALGORITHM
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
 from ..surface import starts
@@ -53,7 +53,7 @@ def _timestamps(take: Take, view: View) -> tuple[Any, ...]:
 
 def _person_files(take: Take, view: View) -> Any:
     pattern = view.mask or view.masks or view.background
-    return [_stamp(path) for path in sorted(take.folder.glob(pattern))] if pattern else []
+    return [_stamp(path) for path in sorted(bounded.matching(take.folder, pattern))] if pattern else []
 
 
 def _track_input(footage: Footage) -> Any:
@@ -95,7 +95,7 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
             inputs = [settings[name] for name in own.settings], own.take(footage)
             before = keys[stage] = store.digest(before, repr(inputs))
         contours = sorted((out / "contours").glob("*.csv"))
-        keys["fit"] += f" {store.digest(*contours)}" if contours else ""
+        keys["fit"] += f" {store.digest(*contours, largest=bounded.TABLE_BYTES)}" if contours else ""
     except OSError as error:
         raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
     return keys
@@ -143,7 +143,7 @@ def _stamp(path: Path) -> tuple[str, int, int]:
 
 
 def _keypoints(take: Take) -> Any:
-    return [(repr(s), [_stamp(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
+    return [(repr(s), [_stamp(path) for path in sorted(bounded.matching(take.folder, s.files))]) for s in take.keypoints]
 
 
 def _clicked(clicks: FrameClicks) -> Any:

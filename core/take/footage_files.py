@@ -1,10 +1,10 @@
 """The footage of the cameras: its files, names of the views guessed from the names of the files, and footage that was moved."""
 
 import re
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, natural
 from .bar_file import bar_path
@@ -96,14 +96,14 @@ def copy_take(source: Path, folder: Path) -> None:
     try:
         for path, copy in ((rig_path, rig), (bar_path(rig_path), bar_path(rig))):
             if path.exists():
-                shutil.copyfile(path, copy)
+                store.write_bytes(copy, bounded.bytes_of(path, bounded.CALIBRATION_BYTES))
     except OSError as error:
         raise InputError(f"Cannot copy the cameras {rig_path} into {folder}: {error.strerror or error}.") from error
 
 
 def _in_folder(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """What lies directly in FOLDER of the files that these patterns name."""
-    return [path for pattern in patterns for path in sorted(folder.glob(Path(pattern).parts[0]))]
+    return [path for pattern in patterns for path in sorted(bounded.matching(folder, Path(pattern).parts[0]))]
 
 
 def find_moved(links: Mapping[str, Path], place: Path) -> dict[Path, Path]:

@@ -14,6 +14,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from ..foundation import bounded
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
 from ..images.sequence import read_image
@@ -76,8 +77,10 @@ def check_pattern(pattern: Any, label: str) -> None:
     """Check a pattern of files.
 
     Raises:
-        InputError: it looks into folders of any depth more than once.
+        InputError: it looks into folders of any depth more than once, or is too long.
     """
+    if isinstance(pattern, str) and len(pattern) > bounded.LONGEST_PATTERN:
+        raise InputError(f"The {label} has a pattern of {len(pattern)} characters; {bounded.LONGEST_PATTERN} is the most.")
     if isinstance(pattern, str) and pattern.count(ANY_DEPTH) > 1:
         raise InputError(f"The {label} has a pattern with more than one “{ANY_DEPTH}”; name the folder, as in “C/*.png”.")
 

@@ -35,6 +35,8 @@ from .sources import (
 
 FORMAT, VERSION = "tricap-take", 1
 MOST_FRAMES = 100_000_000
+MOST_SEEDS = 1000  # clicked surface points, and corners of a polygon: what people click
+MOST_CORRECTIONS = 5000
 SIDED = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDED for s in "LR"))
 KEYS = (
@@ -262,7 +264,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         limits=_limits(body.get("limits", {}), where),
         clicks=_frame_clicks(table_of(table, "seeds", where), names, where),
         keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
-        corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
+        corrections=_corrections(tables_of(table, "corrections", where), names, where),
         keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
         settings=_settings(table, where),
     )
@@ -316,6 +318,12 @@ def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: s
     return tuple(sorted(keyframes, key=lambda k: k.frame))
 
 
+def _corrections(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[Correction, ...]:
+    if len(tables) > MOST_CORRECTIONS:
+        raise InputError(f"{where} has {len(tables)} [[corrections]]; {MOST_CORRECTIONS} is the most.")
+    return tuple(_correction(table, views, where) for table in tables)
+
+
 def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Correction:
     kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
     if kind not in CORRECTIONS:
@@ -324,6 +332,8 @@ def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) ->
     if view not in views:
         raise InputError(f"`view` of {label} is {view!r}.{nearest_name(str(view), views)}")
     frame = table.get("frame")
+    if kind == "region" and isinstance(table.get("polygon"), list) and len(table["polygon"]) > MOST_SEEDS:
+        raise InputError(f"The polygon of {label} has {len(table['polygon'])} corners; {MOST_SEEDS} is the most.")
     if kind == "region":
         frames, corners = frame_pair(table.get("frames"), label), table.get("polygon")
     else:
@@ -340,6 +350,8 @@ def _frame_clicks(table: Mapping[str, Any], views: tuple[str, ...], where: str) 
     frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
     if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
         raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
+    if len(surface) > MOST_SEEDS:
+        raise InputError(f"[seeds] of {where} has {len(surface)} surface seeds; {MOST_SEEDS} is the most. Without any, they are found.")
     check_keys(joints, JOINTS, f"[seeds.joints] of {where}")
     return FrameClicks(
         frame=frame,

@@ -3,6 +3,7 @@
 Editors change the table of the file; keys that they do not change stay, but comments are lost.
 """
 
+import errno
 import glob
 import json
 import shutil
@@ -143,6 +144,8 @@ def link_footage(folder: Path, links: Sequence[Link]) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         for target, source in links:
             if not target.exists():
+                if target.is_symlink():  # a copy, where links cannot be made, would be written to its end
+                    raise FileExistsError(errno.EEXIST, "it is a link to a place that does not exist; remove it", str(target))
                 made.append(target)
                 _link(target, source)
     except OSError as error:

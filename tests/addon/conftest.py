@@ -39,10 +39,10 @@ model = "arm.R"
 """
 
 
-def with_small_texture(take: Path) -> Path:
-    """A take whose skin gets a small texture: the usual one takes as long as all else of a run of a few frames."""
+def with_small_texture(take: Path, more: str = "") -> Path:
+    """A take whose skin gets a small texture: the usual one takes as long as all else of a run of a few frames. `more` settings."""
     with (take / "take.toml").open("a", encoding="utf-8") as file:
-        file.write("[settings.skin]\ntexture_px = 64\n")
+        file.write(f"[settings.skin]\ntexture_px = 64\n{more}")
     return take
 
 

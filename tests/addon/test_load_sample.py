@@ -17,7 +17,7 @@ def small(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     from bl_ext.user_default.tricap.addon.operators import run
 
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    monkeypatch.setattr(run, "SAMPLE", {**run.SAMPLE, "frames": 3, "width_px": 192})
+    monkeypatch.setattr(run, "SAMPLE", {**run.SAMPLE, "frames": 2, "width_px": 192})
     measure, texture = run.measure, {"skin": {"texture_px": 64}}
     monkeypatch.setattr(run, "measure", lambda take, out, overrides, *rest: measure(take, out, overrides | texture, *rest))
     return run
@@ -32,7 +32,7 @@ def test_beside_the_file_with_the_commands_surface(blender: ModuleType, small: M
     make_arm_take(tmp_path / "sample", ArmTakeSettings(**small.SAMPLE))
     with take_run.open_run(tmp_path / "sample", tmp_path / "out") as job:  # of all stages: test_run.py
         pipeline.measure(job, Monitor())
-    assert (out / "clouds" / "0002.ply").read_bytes() == (tmp_path / "out" / "clouds" / "0002.ply").read_bytes()
+    assert (out / "clouds" / "0001.ply").read_bytes() == (tmp_path / "out" / "clouds" / "0001.ply").read_bytes()
     scene = blender.context.scene
     assert scene.tricap.take == "//tricap_sample" and len(scene.tricap.views) == 3 and "body fitted" in scene.tricap.last
     assert blender.data.objects["Body"].animation_data.action is not None
@@ -48,7 +48,7 @@ def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, sm
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
     place = Path(blender.utils.extension_path_user("bl_ext.user_default.tricap"))
     assert Path(blender.context.scene.tricap.take) == place / "tricap_sample"
-    assert (place / "tricap_sample" / "results" / "clouds" / "0002.ply").is_file()
+    assert (place / "tricap_sample" / "results" / "clouds" / "0001.ply").is_file()
 
 
 def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:

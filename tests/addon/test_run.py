@@ -11,14 +11,14 @@ from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 from .conftest import with_small_texture
 
-NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply", "clouds/0003.ply", "skin/0003.ply")
+NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply", "clouds/0001.ply", "skin/0001.ply")
 
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sample recording."""
     folder = tmp_path_factory.mktemp("recordings") / "sample"
-    make_arm_take(folder, ArmTakeSettings(frames=4, width_px=256))
+    make_arm_take(folder, ArmTakeSettings(frames=2, width_px=256))
     return with_small_texture(folder)
 
 

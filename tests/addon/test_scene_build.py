@@ -1,6 +1,7 @@
 """A run's results as a .blend: built, saved, opened again, played."""
 
 import csv
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -194,6 +195,20 @@ def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, sma
     (tmp_path / "run.json").write_text("{}")
     save_blend(tmp_path / "body.blend")
     assert not list(tmp_path.glob("*.blend1"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_saving_does_not_follow_links_that_a_stranger_made_for_it(empty: ModuleType, tmp_path: Path) -> None:
+    """Blender writes NAME@ first. A stranger's folder may contain a link for every number of a process."""
+    from tricap.addon.scene.build import save_blend
+
+    out, letter = tmp_path / "out", tmp_path / "letter.txt"
+    out.mkdir()
+    letter.write_text("mine")
+    for end in ("", "@"):
+        (out / f".x.{os.getpid()}.part.blend{end}").symlink_to(letter if end else tmp_path / "not there")
+    save_blend(out / "x.blend")
+    assert (out / "x.blend").stat().st_size > 1000 and letter.read_text() == "mine" and not (tmp_path / "not there").exists()
 
 
 def test_the_operator_builds_saves_and_keeps_the_open_file(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """What a user may want otherwise: exact skin, T-pose, fewer keys, colours, arrows, pictures."""
 
+import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +15,7 @@ from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
+from tricap.core.body.skin.closed_skin import OneSkin
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
@@ -80,6 +83,12 @@ def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run:
         build_scene(small_run.out, options=SceneOptions(implicit=True, field="Shan"))
 
 
+@cache
+def skin_at_rest(model: str) -> OneSkin:
+    """What `add_skin` makes without a prepared one; a whole body's takes two seconds."""
+    return rest_skin(default_shape(read_model(model)), SkinSettings())
+
+
 def crossing_faces(bpy: ModuleType, thing: object) -> int:
     """How many pairs of faces of the deformed mesh pass through each other."""
     from mathutils.bvhtree import BVHTree
@@ -95,7 +104,7 @@ def test_elbows_and_knees_bend_without_the_skin_crossing_itself(empty: ModuleTyp
 
     shape = default_shape(read_model(model))
     body = armature.add_armature(empty.context.scene.collection, shape)
-    bent = skin.add_skin(empty.context.scene.collection, body, shape)
+    bent = skin.add_skin(empty.context.scene.collection, body, shape, prepared=skin_at_rest(model))
     for degrees in (0, 80, 140):
         for bone in bones:
             body.pose.bones[bone].rotation_euler[0] = np.radians(degrees)
@@ -273,9 +282,19 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     flesh = metaballs.add_metaballs(empty.context.scene.collection, body, shape)
     families = [part for part in flesh if len(world_vertices(empty, part))]
     assert len(families) == 8  # trunk, limbs, where both legs meet the pelvis, and each arm the chest
-    skin_object = skin.add_skin(empty.context.scene.collection, body, shape)
+    skin_object = skin.add_skin(empty.context.scene.collection, body, shape, prepared=skin_at_rest("full"))
     assert skin_object.data.uv_layers and all(len(face.vertices) == 4 for face in skin_object.data.polygons)
-    np.testing.assert_allclose(world_vertices(empty, skin_object), rest_skin(shape, SkinSettings()).vertices_m, atol=2e-5)
+    np.testing.assert_allclose(world_vertices(empty, skin_object), skin_at_rest("full").vertices_m, atol=2e-5)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_turntable_is_not_written_to_the_end_of_a_link(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.scene import preview
+
+    (tmp_path / "letter.txt").write_text("mine")
+    (tmp_path / ".t.part.mp4").symlink_to(tmp_path / "letter.txt")
+    preview._write_movie(tmp_path / "t.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    assert (tmp_path / "letter.txt").read_text() == "mine" and (tmp_path / "t.mp4").stat().st_size > 100
 
 
 @pytest.mark.slow

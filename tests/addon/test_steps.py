@@ -31,7 +31,7 @@ Words = Callable[[], str]
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Footage, cameras and clicks of an arm."""
     folder = tmp_path_factory.mktemp("recordings") / "arm"
-    make_arm_take(folder, ArmTakeSettings(frames=3, width_px=512, interlaced="none"))
+    make_arm_take(folder, ArmTakeSettings(frames=3, width_px=384, interlaced="none"))
     return with_small_texture(folder)
 
 
@@ -87,7 +87,7 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     scene = new_project(blender, sample, tmp_path)
     assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
     assert words() == "done ready done empty empty empty empty empty"
-    assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 fps."
+    assert why("footage") == "3 views, 3 frames of 384×288 pixels, 25 fps."
     assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
     assert "Camera L" in scene.objects and scene.camera.name == "Camera C", "the cameras stand in the viewport"
     scene.tricap.model = "arm.R"
@@ -286,7 +286,7 @@ def blank(folder: Path) -> None:
 
 
 WRONG = {
-    "another size": "was calibrated with images of 640×480 pixels, its footage has 512×384",
+    "another size": "was calibrated with images of 640×480 pixels, its footage has 384×288",
     "no camera for a view": "No camera is called R; the calibration has L, C. Press Match Names",
     "no rig at all": "Cannot read the rig",
     "damaged rig": "rig.toml",
@@ -299,7 +299,7 @@ def test_wrong_cameras(blender: ModuleType, words: Words, why: Any, sample: Path
     path = tmp_path / "take" / "rig.toml"
     rig = read_rig(path)
     if kind == "another size":
-        path.write_text(path.read_text(encoding="utf-8").replace("size = [512, 384]", "size = [640, 480]"), encoding="utf-8")
+        path.write_text(path.read_text(encoding="utf-8").replace("size = [384, 288]", "size = [640, 480]"), encoding="utf-8")
     elif kind == "no camera for a view":
         write_rig(path, type(rig)(cameras=rig.cameras[:2], metadata={}))
     elif kind == "no rig at all":
@@ -526,7 +526,7 @@ def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: An
     assert blender.ops.tricap.find_footage(directory=str(tmp_path / "other film")) == {"FINISHED"}
     assert words().startswith("done") and len(scene.tricap.views) == 3
     clip = scene.tricap.views[0].clip
-    assert "elbow.R" in clip.tracking.tracks and clip.size[0] == 512
+    assert "elbow.R" in clip.tracking.tracks and clip.size[0] == 384
 
 
 def test_while_a_run_goes_on_its_finished_steps_are_seen(blender: ModuleType, words: Words, sample: Path, tmp_path: Path,
@@ -692,8 +692,8 @@ def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[st
         project.write(scene)
     assert read_table(folder) == before and blender.ops.tricap.reload_footage() == {"FINISHED"}
     clip = scene.tricap.views["C"].clip
-    assert clip.frame_duration == 6 and tuple(clip.size) == (512, 384)
-    assert why("footage") == "3 views, 6 frames of 512×384 pixels, 50 fps."
+    assert clip.frame_duration == 6 and tuple(clip.size) == (384, 288)
+    assert why("footage") == "3 views, 6 frames of 384×288 pixels, 50 fps."
     said = read_table(folder)
     assert said["interlaced"] == "both" and said["seeds"]["joints"] == before["seeds"]["joints"] and said["fps"] == before["fps"]
     scene.tricap.views["C"].offset_frames = 1
@@ -734,7 +734,7 @@ def test_the_commands_scene_shows_the_finished_project(
     clips = {view.clip for view in scene.tricap.views}
     assert clips == set(blender.data.movieclips) and len(clips) == 3, "those behind the cameras are used"
     shown = {Path(blender.path.abspath(clip.filepath)).resolve() for clip in clips}
-    assert all(file.is_file() and file.is_relative_to(take) for file in shown) and {clip.size[0] for clip in clips} == {512}
+    assert all(file.is_file() and file.is_relative_to(take) for file in shown) and {clip.size[0] for clip in clips} == {384}
     assert before == {path: path.stat().st_mtime_ns for path in take.rglob("*")}, "opening a file writes nothing"
 
 

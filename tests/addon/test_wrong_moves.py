@@ -23,8 +23,8 @@ STAGES = ("surface", "tracks", "fit the click frame", "skin", "report")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sample recording, with its results in out/."""
     folder = tmp_path_factory.mktemp("wrong") / "kick"
-    make_arm_take(folder, ArmTakeSettings(frames=3, width_px=256, interlaced="none"))
-    pipeline.run(with_small_texture(folder), folder.with_name("out"))
+    make_arm_take(folder, ArmTakeSettings(frames=2, width_px=256, interlaced="none"))
+    pipeline.run(with_small_texture(folder, "[settings.growing]\nspacing_px = 6\n"), folder.with_name("out"))
     return folder
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
+from ...geometry.rig import LARGEST_NUMBER
 from ...geometry.rotation import rotation_from_vector
 
 LARGEST_PX = 100_000
@@ -47,8 +48,8 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
         array = np.array(values, dtype=np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} must be {'×'.join('n' if s < 0 else str(s) for s in shape)} numbers; the file is damaged.") from error
-    if not np.isfinite(array).all():
-        raise InputError(f"{what} has numbers that are not finite; the file is damaged.")
+    if not (np.abs(array) <= LARGEST_NUMBER).all():
+        raise InputError(f"{what} has numbers that are not finite, or beyond {LARGEST_NUMBER:.0e}; the file is damaged.")
     return array
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...body.model_file import read_model, with_limits
+from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...foundation.settings import nearest_name
 from ...motion.formats.c3d import read_c3d
@@ -155,7 +156,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
         InputError: there are no such files, they cannot be read, or none of their names is a joint.
     """
     folder = footage.take.folder
-    paths = sorted((p for p in folder.glob(source.files) if p.is_file()), key=lambda p: natural_order(p.name))
+    paths = sorted((p for p in bounded.matching(folder, source.files) if p.is_file()), key=lambda p: natural_order(p.name))
     if not paths:
         raise InputError(f"There are no keypoints “{source.files}” in {folder}; correct `files` under [[keypoints]].")
     if source.view:

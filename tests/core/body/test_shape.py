@@ -83,6 +83,20 @@ def test_a_model_is_made_from_one_beside_it(tmp_path: Path) -> None:
     assert model_files(whole)[:2] == [whole, part] and len(model_files(whole)) == 4
 
 
+def test_a_model_of_thousands_of_files_and_one_from_elsewhere_are_refused(tmp_path: Path) -> None:
+    """Each file was compared with all before it."""
+    for i in range(40):
+        _own(tmp_path, f"{i}.toml", f'part_of = "{i + 1}.toml"')
+    _own(tmp_path, "40.toml", 'part_of = "arm.R"')
+    assert read_model(tmp_path / "30.toml").skeleton.bones
+    with pytest.raises(InputError, match="is made from more than 16 others in a row"):
+        read_model(tmp_path / "0.toml")
+    (tmp_path / "take").mkdir()
+    for elsewhere in ("../40.toml", str(tmp_path / "40.toml").replace("\\", "/")):
+        with pytest.raises(InputError, match="the file must be in the same folder"):
+            read_model(_own(tmp_path / "take", "a.toml", f'part_of = "{elsewhere}"'))
+
+
 @pytest.mark.parametrize("text", ['mirror_of = "a.toml"', 'part_of = "b.toml"', "mirror_of = 3", 'mirror_of = "nobody"'])
 def test_a_model_made_from_itself_is_refused(text: str, tmp_path: Path) -> None:
     _own(tmp_path, "b.toml", 'mirror_of = "a.toml"')

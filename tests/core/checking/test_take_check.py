@@ -6,6 +6,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -31,6 +32,7 @@ from ..images.test_sequence import with_a_pause
 
 SHARED = Path(__file__).parents[4] / "shared" / "takes"
 Record = Callable[..., Path]
+Fault = Callable[[Path], None]
 
 
 def pictures(take: Path, view: str) -> list[Path]:
@@ -178,17 +180,27 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def fault(request: pytest.FixtureRequest, arm_recording: Record, tmp_path: Path) -> tuple[Checked, str]:
-    make: Callable[[Path], None] = request.param
-    shutil.copytree(arm_recording(), tmp_path / "take")
-    make(tmp_path / "take")
-    return check_take(tmp_path / "take", Monitor()), FAULTS[make]
+TOGETHER = {nobody_clicked: knocked_camera, one_joint_clicked: repeated, contradicting_click: overexposed, seed_on_the_wall: dark}
 
 
-@pytest.mark.parametrize("fault", FAULTS, indirect=True, ids=lambda make: make.__name__)
-def test_the_fault_is_named(fault: tuple[Checked, str]) -> None:
-    checked, cause = fault
+@pytest.fixture(scope="module")
+def checked_with(arm_recording: Record, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Fault], Checked]:
+    """What is found in a recording with a fault. Those of clicks are checked together with one of the images or the rig, once."""
+
+    @cache
+    def check(*faults: Fault) -> Checked:
+        take = Path(shutil.copytree(arm_recording(), tmp_path_factory.mktemp("fault") / "take"))
+        for make in faults:
+            make(take)
+        return check_take(take, Monitor())
+
+    pairs = {fault: (first, second) for first, second in TOGETHER.items() for fault in (first, second)}
+    return lambda fault: check(*pairs.get(fault, (fault,)))
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda make: make.__name__)
+def test_the_fault_is_named(checked_with: Callable[[Fault], Checked], fault: Fault) -> None:
+    checked, cause = checked_with(fault), FAULTS[fault]
     assert cause in {f.cause for f in checked.findings}, checked.lines()
     named = next(f for f in checked.findings if f.cause == cause)
     assert named.sentence.endswith(".") and str(checked.to_table())

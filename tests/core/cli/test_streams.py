@@ -77,7 +77,18 @@ def test_faults_of_the_system_are_sentences() -> None:
     assert said and "File name too long" in said and len(said) < 1600
     assert "memory" in str(sentence_of(MemoryError()))
     assert "memory" in str(sentence_of(ImportError("/usr/lib/x.so: failed to map segment from shared object")))
+    assert "thread" in str(sentence_of(RuntimeError("can't start new thread"))) and sentence_of(RuntimeError("a")) is None
     assert sentence_of(ImportError("No module named 'x'")) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux keeps such limits")
+def test_a_limit_of_memory_is_one_sentence(rig: Path) -> None:
+    for megabytes in (150, 560):
+        done = shell(f"ulimit -v {megabytes << 10}; tricap check RIG", rig)
+        said = f"tricap: Tricap needs 800 MB of memory, and the limit is {megabytes} MB. Raise the limit (ulimit -v, -d).\n"
+        assert done.returncode == 2 and done.stderr.decode() == said, done
+    assert shell("ulimit -d 100000; tricap check RIG >&- 2>&-", rig).returncode == 2
+    assert shell("ulimit -v 1000000; tricap check RIG", rig).returncode == 1
 
 
 def test_a_name_that_is_too_long_is_one_sentence(rig: Path) -> None:

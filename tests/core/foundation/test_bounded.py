@@ -71,6 +71,32 @@ def test_numbers_and_tables_without_end_are_one_sentence(tmp_path: Path, case: s
         assert len(str(refused.value)) < 500
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_pattern_through_links_in_circles_is_matched_in_a_moment(tmp_path: Path) -> None:
+    """Two links to their own folder give it 2²⁵ names of 25 parts."""
+    (tmp_path / "L").mkdir()
+    (tmp_path / "L" / "0.png").write_bytes(b"")
+    for name in ("a", "b"):
+        (tmp_path / name).symlink_to(".")
+    began = time.process_time()
+    for stars in ("*/" * 25, "[ab]/" * 39, "L/../" * 20 + "*/L/../*/"):
+        assert [path.name for path in bounded.matching(tmp_path, stars + "L/*.png")] == ["0.png"]
+    assert bounded.matching(tmp_path, "*/" * 100 + "L/*.png") == []  # more links than a path may have
+    assert time.process_time() - began < SECONDS
+
+
+def test_patterns_are_matched_as_people_write_them(tmp_path: Path) -> None:
+    for name in ("L/a/0.png", "L/b/1.png", "R/2.png", "3.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    expected = {"*.png": ["3.png"], "L/*/*.png": ["L/a/0.png", "L/b/1.png"], "[LR]/2.png": ["R/2.png"], "L/a/0.png": ["L/a/0.png"],
+                "./R/*": ["R/2.png"], "**/*.png": ["3.png", "L/a/0.png", "L/b/1.png", "R/2.png"], "L/**/?.png": ["L/a/0.png", "L/b/1.png"],
+                "": [], "a**b": [], "[" * 50_000: [], "*a" * 400: [], "no/*": []}  # fmt: skip
+    for pattern, names in expected.items():
+        found = [path.relative_to(tmp_path).as_posix() for path in bounded.matching(tmp_path, pattern)]
+        assert sorted(found) == names, pattern[:50]
+
+
 def test_dotted_keys_and_values_that_people_write_are_read() -> None:
     text = 'a.b."c.d".e = "1.2.3.4"\nf = [1.5, 2.5, [3.5]]\n[settings.matching]\npatch_px = 9223372036854775807\n'
     assert bounded.toml_of(text)["a"]["b"]["c.d"]["e"] == "1.2.3.4"

@@ -169,6 +169,29 @@ def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
     assert store.digest(tmp_path / "x", "y") == store.digest(data, "y") != store.digest(data + b"y")
 
 
+def test_another_program_writes_under_a_name_that_nobody_knows_before(tmp_path: Path) -> None:
+    part = store.part_of(tmp_path / "a" / "x.blend")
+    assert part != store.part_of(tmp_path / "a" / "x.blend") and part.match(".x.*.part.blend")
+    store.try_writing(part)
+    assert list((tmp_path / "a").iterdir()) == []
+    part.write_text("") if os.name == "nt" else part.symlink_to(tmp_path / "not there")
+    with pytest.raises(FileExistsError):
+        store.try_writing(part)
+    assert not (tmp_path / "not there").exists(), "nothing is made at the end of a link"
+
+
+def test_a_file_that_is_too_large_is_not_read_for_its_digest(tmp_path: Path) -> None:
+    """A mask that is a sparse file of 20 GB takes no room on the disk, and took minutes."""
+    with (tmp_path / "mask.png").open("wb") as file:
+        file.truncate(600_000_000)
+    with pytest.raises(InputError, match="mask.png: it is larger than 512 MB"):
+        store.digest("key", tmp_path / "mask.png")
+    (tmp_path / "a.toml").write_bytes(b"# sound")
+    with pytest.raises(InputError, match="a.toml: it is larger than 0 MB"):
+        store.digest(tmp_path / "a.toml", largest=6)
+    assert store.digest(tmp_path / "a.toml", largest=7) == store.digest(b"# sound")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
 def test_results_have_the_rights_that_the_user_asked_for(tmp_path: Path) -> None:
     before = os.umask(0o077)

@@ -91,6 +91,8 @@ FAULTS = {
     "lacks translation": (text({"translation": None}), "lacks “translation”"),
     "NaN": (text({"translation": "[1.0, nan, 3.0]"}), "“translation” of camera “L” .* must be 3 finite numbers"),
     "infinite": (text({"rotation": "[1.0, inf, 3.0]"}), "“rotation” of .* must be 3 finite numbers"),
+    "an overflow": (text({"matrix": "[[1e308, 0, 9.0], [0, 1500.0, 9.0], [0, 0, 1.0]]"}), "must be 3x3 finite numbers, none beyond"),
+    "distortions": (text({"distortions": "[-1e300, 0, 0, 0]"}), "must be n finite numbers, none beyond"),
     "words": (text({"matrix": '[["a"]]'}), "must be 3x3 finite numbers"),
     "ragged": (text({"matrix": "[[1.0], [1.0, 2.0]]"}), "must be 3x3 finite numbers"),
     "matrix too small": (text({"matrix": "[[1500.0, 0.0], [0.0, 1500.0]]"}), "must be 3x3 finite numbers"),

@@ -97,5 +97,7 @@ def test_a_movie_marked_as_interlaced_is_refused(tmp_path: Path, monkeypatch: py
     path.write_bytes(zlib.decompress(b64decode(INTERLACED)))
     with pytest.raises(InputError, match="m.mp4 is marked as interlaced, .*: ffmpeg -i m.mp4 -vf setfield=prog -c:v ffv1 new.mkv"):
         Movie(path)
+    with pytest.raises(InputError, match="ffmpeg -i 'm;reboot .mp4' -vf"):  # the line is made to be copied
+        Movie(path.rename(tmp_path / "m;reboot .mp4"))
     monkeypatch.setattr(packets, "FIELDS", ("MJPG",))
     assert Movie(avi(tmp_path / "n.avi", [(64, 48)] * 3)).read(2).shape == (48, 64), "frames that differ were decoded"

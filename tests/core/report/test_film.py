@@ -1,5 +1,6 @@
 """The movie of the body over every frame of every view, from the files of a run."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,17 @@ def test_the_body_is_over_every_frame(plane_take: Path, results: Results) -> Non
         panel = pictures[0][:height, k * width : (k + 1) * width].astype(int)
         assert 0.01 < (panel[..., 2] - panel[..., 0] > 30).mean() < 0.5
     assert not results.path("cache", "film.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    "other_name", [Path.hardlink_to, pytest.param(Path.symlink_to, marks=pytest.mark.skipif(os.name == "nt", reason="a right"))]
+)
+def test_a_file_with_another_name_is_not_written_over(plane_take: Path, results: Results, tmp_path: Path, other_name: Any) -> None:
+    (tmp_path / "letter.txt").write_text("mine")
+    results.path("cache").mkdir()
+    other_name(results.path("cache", "film.mp4"), tmp_path / "letter.txt")
+    assert write_film(open_take(read_take(plane_take)), results, Monitor()).stat().st_size > 1000
+    assert (tmp_path / "letter.txt").read_text() == "mine"
 
 
 def test_a_stopped_film_is_no_film(plane_take: Path, results: Results) -> None:

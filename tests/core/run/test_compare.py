@@ -1,6 +1,7 @@
 """The published and the default method side by side: the measures, the page, and what is refused."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -60,3 +61,13 @@ def test_both_methods_on_a_take(plane_take: Path, tmp_path: Path, scenes: Any, c
     assert main(command) == 0 and (out / DEFAULT / "run.json").stat().st_mtime_ns == before
     assert main([*command, "--set", "method.preset=published"]) == 2 and "leave out --preset" in capsys.readouterr().err
     assert main(["compare", str(take), "--out", str(take)]) == 2 and "is itself a take" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_method_s_folder_that_leads_elsewhere_is_refused(plane_take: Path, tmp_path: Path, capsys: Any) -> None:
+    for method in (PUBLISHED, DEFAULT):
+        (tmp_path / method / "elsewhere").mkdir(parents=True)
+        (tmp_path / method / "out").mkdir()
+        (tmp_path / method / "out" / method).symlink_to(tmp_path / method / "elsewhere")
+        assert main(["compare", str(plane_take), "--out", str(tmp_path / method / "out"), "--frames", "0:1", "--quiet"]) == 2
+        assert "is a link to a place outside" in capsys.readouterr().err and not any((tmp_path / method / "elsewhere").iterdir())

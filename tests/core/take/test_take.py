@@ -13,6 +13,8 @@ from tricap.core.take.footage import open_take
 from tricap.core.take.take import Take, read_take
 
 HEAD = dict(format='"tricap-take"', version="1", fps="25.0", rig='"rig.toml"')
+CORNER = "[1, 2], "
+CLICK = "{ L = [1, 2], C = [1, 2] }, "
 VIEWS = "".join(f'[[views]]\nname = "{v}"\nimages = "{v}/*.png"\n' for v in "LCR")
 
 
@@ -107,6 +109,8 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
 
 
 KEYFRAME = '[[keyframes]]\nframe = 3\n[keyframes.joints]\n"elbow.R" = { L = [5, 5], C = [5, 5] }\n'
+CORNER = "[1, 2], "
+CLICK = "{ L = [1, 2], C = [1, 2] }, "
 REGION = '[[corrections]]\nkind = "region"\nview = "C"\nframes = [2, 9]\n'
 TRAJECTORY = REGION.replace("region", "trajectory").replace("frames = [2, 9]", "frame = 1")
 SEED, JOINT = "[seeds]\n", "[seeds.joints]\n"
@@ -158,6 +162,7 @@ FAULTS = {
     "footage a number": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = 3\n'), "needs either `images`"),
     "footage at any depth twice": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = "**/a/**/*.png"\n'), "with more than one"),
     "masks at any depth twice": (text(views=VIEWS + 'masks = "**/**/*.png"\n'), "with more than one"),
+    "an endless pattern": (text(views=VIEWS.replace("L/*", "L/" + "[" * 50_000, 1)), "pattern of 5.* characters"),
     "keypoints at any depth twice": (text(more='[[keypoints]]\nfiles = "**/**/*.json"\nview = "C"\n'), "with more than one"),
     "body a word": (text(dict(body='"arm.R"')), "\\[body\\] of .* must be a table"),
     "model a number": (text(more="[body]\nmodel = 3\n"), "`model` under \\[body\\] of .* is 3"),
@@ -165,6 +170,9 @@ FAULTS = {
     "seed frame": (text(more=SEED + 'frame = "0"\n'), "needs frame \\(a whole number\\)"),
     "surface no list": (text(more=SEED + "surface = { L = [1, 2] }\n"), "surface \\(a list\\)"),
     "surface of pairs": (text(more=SEED + "surface = [[1, 2]]\n"), "surface seed 1 of .* must name views and pixels"),
+    "20,000 surface seeds": (text(more=SEED + f"surface = [{CLICK * 20_000}]\n"), "has 20000 surface seeds; 1000 is the most"),
+    "a polygon of 100,000 corners": (text(more=REGION + f"polygon = [{CORNER * 100_000}]\n"), "has 100000 corners; 1000 is the most"),
+    "10,000 corrections": (text(more=(REGION + f"polygon = [{CORNER * 3}]\n") * 10_000), "has 10000 ..corrections..; 5000 is the most"),
     "click of three": (text(more=JOINT + '"elbow.R" = { L = [1, 2, 3] }\n'), "is \\[1, 2, 3\\]; write two pixel coordinates"),
     "click NaN": (text(more=JOINT + '"elbow.R" = { L = [nan, 2] }\n'), "joint “elbow.R” of .* in view L is \\[nan, 2\\]"),
     "click of words": (text(more=JOINT + '"elbow.R" = { L = ["1", 2] }\n'), "write two pixel coordinates"),

@@ -1,12 +1,15 @@
 """Writing take.toml: what TOML reads comes back exactly, nothing is written in vain, and nothing wrong is written."""
 
+import os
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.take.writing import new_table, read_table, renumbered, take_of_table, toml_text, write_table
+from tricap.core.take.footage_files import copy_take
+from tricap.core.take.take import read_take
+from tricap.core.take.writing import link_footage, new_table, read_table, renumbered, take_of_table, toml_text, write_table
 
 FULL = {
     "format": "tricap-take", "version": 1, "fps": 29.97, "interlaced": "odd", "rig": "rig.toml", "reference_view": "C", "frames": [2, 40],
@@ -69,3 +72,23 @@ def test_frames_are_renumbered_when_an_image_becomes_two() -> None:
     assert renumbered(double, 1, 2) == table and renumbered({"fps": 25.0}, 2, 1) == {"fps": 25.0}
     both = {"keyframes": [{"frame": 4, "joints": {"a": 1}}, {"frame": 5, "joints": {"a": 2}}], "frames": [3, 9]}
     assert renumbered(both, 1, 2) == {"keyframes": [{"frame": 2, "joints": {"a": 1}}], "frames": [1, 5]}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_footage_is_not_copied_to_the_end_of_a_link(tmp_path: Path) -> None:
+    """A link that exists cannot be made; where links cannot be made at all, footage is copied."""
+    (tmp_path / "film.mp4").write_bytes(b"film")
+    (tmp_path / "take").mkdir()
+    (tmp_path / "take" / "L.mp4").symlink_to(tmp_path / "profile")
+    with pytest.raises(InputError, match="is a link to a place that does not exist; remove it"):
+        link_footage(tmp_path / "take", [(tmp_path / "take" / "L.mp4", tmp_path / "film.mp4")])
+    assert not (tmp_path / "profile").exists() and (tmp_path / "take" / "L.mp4").is_symlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_cameras_are_not_copied_to_the_end_of_a_link(plane_take: Path, tmp_path: Path) -> None:
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "rig.toml").symlink_to(tmp_path / "letter.txt")
+    (tmp_path / "letter.txt").write_text("mine")
+    copy_take(plane_take, tmp_path / "copy")
+    assert (tmp_path / "letter.txt").read_text() == "mine" and read_take(tmp_path / "copy").rig_path.is_file()

@@ -161,6 +161,9 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     (take / "L").rename(tmp_path / "L")
     (take / "L").symlink_to(tmp_path / "L")
     assert main([*command, "--pictures", str(tmp_path)]) == 2 and "contains the footage" in capsys.readouterr().err
+    (tmp_path / "led").mkdir()
+    (tmp_path / "led" / "C").symlink_to(tmp_path / "out")
+    assert main([*command, "--pictures", str(tmp_path / "led")]) == 2 and "is a link to a place outside" in capsys.readouterr().err
     assert main(["track", str(take), "--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "p")]) == 2
     assert main([*command, "--points-frame", "9"]) == 2 and "--points-frame 9" in capsys.readouterr().err
     (tmp_path / "points.csv").write_text("point,view,x,y\nnose,L,20,2000\n")
