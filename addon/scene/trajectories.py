@@ -20,9 +20,11 @@ TRAIL_RADIUS_M = 0.0006
 REDDEST_SPEED_M_S = 2.0  # painted red
 
 
-def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
-    """One object from the arrays of trajectories.npz and the bones of their points: frames (T,), xyz_m (T, N, 3) with NaN = not visible,
-    velocity_m_s, sigma_m (T, N), segment (T, N)."""
+def add_trajectories(
+    collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], trail: int = TRAIL_FRAMES, radius_m: float = TRAIL_RADIUS_M
+) -> bpy.types.Object:
+    """One object, whose trails are `trail` frames long and `radius_m` thick, from the arrays of trajectories.npz and the bones of their
+    points: frames (T,), xyz_m (T, N, 3) with NaN = not visible, velocity_m_s, sigma_m (T, N), segment (T, N)."""
     xyz, frames = arrays["xyz_m"], arrays["frames"]
     visible = np.isfinite(xyz).all(axis=-1)  # (T, N)
     row, track = np.nonzero(visible)
@@ -47,7 +49,7 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     mesh.materials.append(material)
     trail_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(trail_object)
-    trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material)
+    trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material, trail, radius_m)
     return trail_object
 
 
@@ -83,7 +85,7 @@ def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray
     return arrows_object
 
 
-def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy.types.NodeTree:
+def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES, radius_m: float = TRAIL_RADIUS_M) -> bpy.types.NodeTree:
     """Geometry nodes: the edges of the last `Trail` frames before the current one, as thin tubes."""
     group, group_input, group_output = nodes.new_group("Tricap trail")
     trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
@@ -98,7 +100,7 @@ def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy
     curve = nodes.add(group, "GeometryNodeMeshToCurve")
     profile = nodes.add(group, "GeometryNodeCurvePrimitiveCircle")
     profile.inputs["Resolution"].default_value = 3
-    nodes.active(profile.inputs, "Radius").default_value = TRAIL_RADIUS_M
+    nodes.active(profile.inputs, "Radius").default_value = radius_m
     tube = nodes.add(group, "GeometryNodeCurveToMesh")
     paint_node = nodes.add(group, "GeometryNodeSetMaterial")
     paint_node.inputs["Material"].default_value = material
