@@ -1,7 +1,6 @@
 """Trajectories before and after the filters, from the front and from the side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all that were
 tracked, what was removed, by reason, and what was kept."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 from ..foundation import store
 from ..geometry.camera import Camera
 from ..tracking.settings import TrackStatus
+from .drawing import add_axes, add_scale
 
 SIDE_PX = 360
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
@@ -73,13 +73,13 @@ def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits
     """Both views of places (T, N, 3) in the camera's axes, of those that are `shown` (T, N), with a scale."""
     middle, half = limits
     pair = []
-    for axes, signs, names in (((0, 1), (1, 1), "x y"), ((2, 1), (-1, 1), "z y")):
+    for axes, signs, names in (((0, 1), (1, 1), ("x", "y")), ((2, 1), (-1, 1), ("z", "y"))):
         xy = SIDE_PX / 2 * (1 + (place[..., axes] - middle[list(axes)]) * signs / half)
-        pair.append(_trails(xy, shown, colours, half, names.split()))
+        pair.append(_trails(xy, shown, colours, half, names))
     return np.hstack(pair)
 
 
-def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: float, names: Sequence[str]) -> np.ndarray:
+def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: float, names: tuple[str, str]) -> np.ndarray:
     """The steps to the shown places as lines, with a scale and the axes."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8)
     pixel = np.clip(np.nan_to_num(xy), -9 * SIDE_PX, 9 * SIDE_PX)
@@ -87,24 +87,6 @@ def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: floa
     lines, colour = np.rint(8 * np.stack([pixel[:-1][step], pixel[1:][step]], axis=1)).astype(np.int32), colours[1:][step]
     for one in np.unique(colour, axis=0):
         cv2.polylines(picture, list(lines[(colour == one).all(axis=1)]), False, one.tolist(), 1, cv2.LINE_AA, 3)
-    bar_m = 10.0 ** np.floor(np.log10(half_m))
-    bar = round(SIDE_PX / 2 * bar_m / half_m)
-    cv2.line(picture, (12, SIDE_PX - 14), (12 + bar, SIDE_PX - 14), (255, 255, 255), 2)
-    label = f"{bar_m:g} m" if bar_m >= 1 else f"{100 * bar_m:g} cm"
-    cv2.putText(picture, label, (12, SIDE_PX - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
-    corner = np.array([SIDE_PX - 44, SIDE_PX - 34])
-    for name, end in zip(names, ((26, 0), (0, 26))):
-        sign = -1 if name == "z" else 1
-        tip = corner + np.array(end) * sign
-        cv2.arrowedLine(picture, tuple(corner.tolist()), tuple(tip.tolist()), (255, 255, 255), 1, cv2.LINE_AA, tipLength=0.25)
-        cv2.putText(
-            picture,
-            name,
-            tuple((tip + (-10 if sign < 0 else 3, 4)).tolist()),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.4,
-            (255, 255, 255),
-            1,
-            cv2.LINE_AA,
-        )
+    add_scale(picture, SIDE_PX / 2 / half_m)
+    add_axes(picture, names, left=names[0] == "z")
     return picture
