@@ -29,7 +29,7 @@ from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
-from .trajectories import add_arrows, add_trajectories, sparser
+from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser
 
 COLLECTION = "Tricap"
 MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
@@ -334,6 +334,9 @@ def _add_trajectories(
     _name_segments(add_trajectories(collection, shown), contents)
     if options.arrows:
         add_arrows(collection, shown)
+        add_bends(collection, shown)
+    if contents.raw is not None:
+        add_removed(collection, contents.raw, options.most_points)
     return int(shown["xyz_m"].shape[1])
 
 

@@ -32,12 +32,12 @@ from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
 from .overview import LEGEND, body_by_sigma, bone_sigma_mm, strip_frames, verdict, window_px
 from .silhouettes import OUTLINE, PERSON, Silhouettes
-from .trails import trail_pictures
+from .trails import trail_pictures, vector_pictures
 
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
 KINDS = {  # of pictures
     "Measured surface": ("surface", "cloud"),
-    "Trajectories": ("tracks", "trails"),
+    "Trajectories": ("tracks", "vectors", "trails"),
     "Body over the footage": ("body",),
     "Layers of the body": ("layers",),
 }
@@ -88,6 +88,10 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     shown = _pictures(report, monitor, pictured, skinned=skin_at is not None) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
+    if report.trajectories is not None:
+        tracks, camera = report.trajectories, report.footage.rig.cameras[report.footage.take.reference]
+        vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2)
+        shown |= {f"vectors_{name}.png": picture for name, picture in zip(("velocity", "acceleration"), vectors)}
     shown |= _layers(report, skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
@@ -219,7 +223,23 @@ def _measurement_graphs(report: Report) -> list[str]:
     ]
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
+        for title, unit, vectors in (
+            ("Speed of the tracked points (median, 95 %)", "m/s", trajectories.velocity_m_s),
+            ("Acceleration of the tracked points (median, 95 %)", "m/s²", trajectories.acceleration_m_s2),
+        ):
+            graphs.append(curve_graph(title, unit, trajectories.frames, _typical(vectors)))
     return graphs
+
+
+def _typical(vectors: np.ndarray) -> dict[str, np.ndarray]:
+    """The median and the 95th percentile (T,) of the size of vectors (T, N, 3) in each frame; NaN in a frame without any."""
+    found = np.full((2, len(vectors)), np.nan)
+    for t, row in enumerate(vectors):
+        size = np.linalg.norm(row, axis=1)
+        size = size[np.isfinite(size)]
+        if len(size):
+            found[:, t] = np.percentile(size, [50, 95])
+    return {"median": found[0], "95 %": found[1]}
 
 
 def _limbs(body: BodyFit | None) -> str:

@@ -8,28 +8,17 @@ import numpy as np
 
 from ..foundation import store
 from ..geometry.camera import Camera
+from ..tracking.reasons import COLOUR_WORDS, REASON_COLOURS
 from ..tracking.settings import TrackStatus
+from ..tracking.trajectories import Trajectories
 from .drawing import add_axes, add_scale
 
 SIDE_PX = 360
+MOST_ARROWS = 700  # in one picture; of more, every n-th point
+ARROW = 0.12  # length of the longest arrows, by half the picture
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
 GROUND = (28, 28, 28)
 ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
-REASONS = {  # BGR by reason; the others are grey
-    TrackStatus.NOT_FOUND: (60, 160, 250),
-    TrackStatus.NOT_MATCHED: (60, 160, 250),
-    TrackStatus.NOT_VERIFIED: (40, 220, 240),
-    TrackStatus.RAYS_MISS: (40, 220, 240),
-    TrackStatus.TOO_FAST: (70, 70, 240),
-    TrackStatus.ACCELERATES: (70, 70, 240),
-    TrackStatus.NOT_UNIFORM: (230, 110, 200),
-    TrackStatus.NOT_RIGID: (230, 110, 200),
-    TrackStatus.UNSUPPORTED: (230, 110, 200),
-    TrackStatus.UNCERTAIN: (230, 160, 70),
-}
-COLOUR_WORDS = (
-    "red too fast or accelerating, violet unlike its neighbours, blue uncertain, yellow not verified, orange not found, grey others"
-)
 
 
 def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
@@ -51,7 +40,7 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     removed = seen & ~kept
     reason = np.where(removed, status, 0)
     colours = np.full((*status.shape, 3), (150, 150, 150), dtype=np.int64)
-    for value, colour in REASONS.items():
+    for value, colour in REASON_COLOURS.items():
         colours[reason == value] = colour
     grey, green = (np.broadcast_to(np.array(c), colours.shape) for c in (ALL_COLOUR, KEPT_COLOUR))
     some = f", one trajectory in {every}" if every > 1 else ""
@@ -61,6 +50,45 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
         (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", both_views(place, removed, colours, limits)),
         (f"The {int(kept.sum()):,} positions that were kept, {both}", both_views(place, kept, green, limits)),
     ]
+
+
+def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> list[tuple[str, np.ndarray]]:
+    """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the front and from the side
+    (D'Apuzzo et al. 1999, Fig. 9); none without any."""
+    found, place = [], camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
+    for name, unit, vectors in (
+        ("velocities", "m/s", trajectories.velocity_m_s[index]),
+        ("accelerations", "m/s²", trajectories.acceleration_m_s2[index]),
+    ):
+        own = vectors.astype(np.float64) @ camera.R_cam_world.T
+        rows = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(own).all(axis=1))
+        if not len(rows):
+            continue
+        every = max(1, -(-len(rows) // MOST_ARROWS))
+        rows = rows[::every]
+        size = np.linalg.norm(own[rows], axis=1)
+        longest = max(float(np.percentile(size, 95)), 1e-6)
+        limits = limits_of(place[rows])
+        arrows = own[rows] * (ARROW * limits[1] / longest)
+        pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
+        some = f", one point in {every}" if every > 1 else ""
+        words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
+        found.append((f"{words}; blue 0, red {longest:.2g} {unit} or more, an arrow that long", np.hstack(pair)))
+    return found
+
+
+def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tuple[np.ndarray, float], axes: str) -> np.ndarray:
+    """Arrows (N, 3) at places (N, 3), coloured by their share (N,) of the longest."""
+    picture, (middle, half) = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8), limits
+    rows, signs = (0, 1) if axes == "xy" else (2, 1), np.array([1.0 if axes == "xy" else -1.0, 1.0])
+    start, end = (SIDE_PX / 2 * (1 + (p[:, rows] - middle[list(rows)]) * signs / half) for p in (place, place + arrows))
+    tints = cv2.applyColorMap(np.clip(255 * share, 0, 255).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
+    ends = np.clip(np.rint(8 * np.stack([start, end], axis=1)), -(2**20), 2**20).astype(int)
+    for (a, b), tint in zip(ends.tolist(), tints.tolist()):
+        cv2.arrowedLine(picture, a, b, tint, 1, cv2.LINE_AA, 3, 0.3)
+    add_scale(picture, SIDE_PX / 2 / half)
+    add_axes(picture, (axes[0], axes[1]), left=axes == "zy")
+    return picture
 
 
 def limits_of(points: np.ndarray) -> tuple[np.ndarray, float]:

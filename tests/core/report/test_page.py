@@ -26,8 +26,10 @@ from tricap.core.report.overview import CELL_PX, body_by_sigma, bone_sigma_mm, s
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
-from tricap.core.report.trails import GROUND, KEPT_COLOUR, REASONS, SIDE_PX, trail_pictures
+from tricap.core.report.trails import GROUND, KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.tracking.reasons import REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
+from tricap.core.tracking.trajectories import with_kinematics
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed (Debian: chromium)")
@@ -139,10 +141,32 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
         size = np.linalg.norm(over, axis=2)
         return bool((over @ wanted > 0.99 * size * np.linalg.norm(wanted))[size > 40].any())
 
-    assert has(red, REASONS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
-    assert before.any() and not has(before, REASONS[TrackStatus.TOO_FAST])
+    assert has(red, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert before.any() and not has(before, REASON_COLOURS[TrackStatus.TOO_FAST])
     assert trail_pictures(tmp_path / "none.npz", camera) == []
     assert trail_pictures(raw(tmp_path / "empty.npz", np.zeros((3, 2), dtype=np.int8)), camera) == []
+
+
+def test_vectors_point_where_the_points_go(scenes: Any) -> None:
+    """Three points that go to the right faster and faster: arrows to the right in front, none from the side, with the sizes in words."""
+    camera = scenes.three_cameras()["C"]
+    t = np.arange(5.0)[:, None, None]
+    right = camera.R_cam_world[0]
+    xyz = (
+        2.0 * camera.R_cam_world[2]
+        + camera.centre_m
+        + np.linspace(-0.1, 0.1, 3)[:, None] * camera.R_cam_world[1]
+        + 0.5 * t**2 * 0.01 * right
+    )
+    tracks = with_kinematics(np.arange(5), np.arange(5) / 10, xyz, np.full((5, 3), 1e-3), np.ones((5, 3), dtype=np.int8), 0)
+    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2)
+    assert "velocities of 3 tracked points" in speed and "red 0.2 m/s" in speed and "red 1 m/s²" in bend
+    front, side = np.split(front_and_side, 2, axis=1)
+    red = [(p[..., 2].astype(int) - p[..., 0] > 60) & (p[..., 1] < 120) for p in (front, side)]
+    columns = [len(np.unique(np.nonzero(r)[1])) for r in red]
+    assert columns[0] > 15 and columns[0] > 2 * columns[1]
+    empty = with_kinematics(np.arange(1), np.arange(1) / 10, xyz[:1], np.full((1, 3), 1e-3), np.ones((1, 3), dtype=np.int8), 0)
+    assert vector_pictures(empty, camera, 0) == [], "a single frame has no velocities"
 
 
 def page(tmp_path: Path) -> Path:
