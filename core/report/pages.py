@@ -41,6 +41,7 @@ KINDS = {  # of pictures
     "Body over the footage": ("body",),
     "Layers of the body": ("layers",),
 }
+BROAD = ("cloud", "vectors", "trails")  # of two panels
 AXES = "Axes of the reference camera: x to the right, y down, z away from it. In the rest pose: x to the person's left, z up."
 SIDES = {"L": "Left", "R": "Right"}
 LABELS = {
@@ -224,8 +225,8 @@ def _measurement_graphs(report: Report) -> list[str]:
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
         for title, unit, vectors in (
-            ("Speed of the tracked points (median, 95 %)", "m/s", trajectories.velocity_m_s),
-            ("Acceleration of the tracked points (median, 95 %)", "m/s²", trajectories.acceleration_m_s2),
+            ("Speed of the tracked points: median (red), 95 % (blue)", "m/s", trajectories.velocity_m_s),
+            ("Acceleration of the tracked points: median (red), 95 % (blue)", "m/s²", trajectories.acceleration_m_s2),
         ):
             graphs.append(curve_graph(title, unit, trajectories.frames, _typical(vectors)))
     return graphs
@@ -248,7 +249,7 @@ def _limbs(body: BodyFit | None) -> str:
         return ""
     frames, words = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
     lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
-    return f'<h2>Limbs</h2>{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
+    return f'<h2>Limbs</h2><div class="wide">{limb_strip(frames, words)}</div><p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
 
 
 def _limb_graphs(report: Report) -> dict[str, list[str]]:
@@ -285,10 +286,13 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         f"{record['fps']:g} frames/s, interlaced: {record['interlaced']}"
     )
     cells = "".join(figure(caption, picture) for caption, picture in strip)
+    found = {
+        kind: [figure(*files[name]) for name in files if name.startswith((f"{kind}_", f"{kind}."))] for kind in sum(KINDS.values(), ())
+    }
     shown = "".join(
-        f"<h2>{title}</h2><div class='row{' single' if len(found) == 1 else ''}'>{''.join(found)}</div>"
+        f"<h2>{title}</h2>{''.join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])}"
         for title, kinds in KINDS.items()
-        if (found := [figure(*files[name]) for kind in kinds for name in files if name.startswith((f"{kind}_", f"{kind}."))])
+        if any(found[kind] for kind in kinds)
     )
     limbs = "".join(_folded(limb, _grid(graphs)) for limb, graphs in _limb_graphs(report).items() if any(graphs))
     settings = "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
@@ -309,6 +313,12 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         + _folded("Settings", f"<pre>{html.escape(settings)}</pre>")
     )
     return document(f"Tricap: {report.record['take'].rsplit('/', 1)[-1]}", body, SCRIPT)
+
+
+def _picture_row(kind: str, figures: Sequence[str]) -> str:
+    """Figures beside each other; those that have two or four panels are wider."""
+    width = "single" if len(figures) == 1 else "broad" if kind in BROAD else ""
+    return f'<div class="row {width}">{"".join(figures)}</div>'
 
 
 def _grid(graphs: Sequence[str]) -> str:

@@ -15,7 +15,8 @@ from .drawing import add_axes, add_scale
 
 SIDE_PX = 360
 MOST_ARROWS = 700  # in one picture; of more, every n-th point
-ARROW = 0.12  # length of the longest arrows, by half the picture
+ARROW = 0.12  # length of the longest arrows, by half the picture; of the few beyond them at most …
+MOST_LONG = 2.0  # … this many times as long
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
 GROUND = (28, 28, 28)
 ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
@@ -69,7 +70,7 @@ def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> l
         size = np.linalg.norm(own[rows], axis=1)
         longest = max(float(np.percentile(size, 95)), 1e-6)
         limits = limits_of(place[rows])
-        arrows = own[rows] * (ARROW * limits[1] / longest)
+        arrows = own[rows] * (ARROW * limits[1] / longest * np.minimum(1.0, MOST_LONG * longest / np.maximum(size, 1e-12)))[:, None]
         pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
         words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"

@@ -197,15 +197,17 @@ def test_names_are_text(tmp_path: Path) -> None:
 
 
 @needs_browser
-@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark")])
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark"), (794, 4, "paper")])
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
     watch = "window.failed = []; addEventListener('error', e => failed.push(e.message))"
     allowed = " ".join(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'" for code in (watch, PROBE))
     text = text.replace("script-src ", f"script-src {allowed} ")  # besides the page's own script
-    if scheme == "dark":
-        text = text.replace("(prefers-color-scheme:dark)", "all")
+    if scheme != "light":
+        text = text.replace(
+            {"dark": "(prefers-color-scheme:dark)", "paper": "@media print"}[scheme], {"dark": "all", "paper": "@media all"}[scheme]
+        )
     graph = curve_graph("first", "°", np.arange(11), {"a": 2.0 * np.arange(11)}, np.full(11, 1.0), limits=(-5.0, 15.0), marks=[4])
     text = text.replace("<h1>", f"<script>{watch}</script>{graph}<h1>", 1).replace("</body>", f"<script>{PROBE}</script></body>")
     (tmp_path / "probe.html").write_text(text)
@@ -216,7 +218,7 @@ def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, sche
     assert found, dom[-2000:]
     seen = json.loads(found[1])
     assert seen["errors"] == [] and seen["width"] <= seen["inner"] and seen["columns"] == columns
-    assert seen["paper"] == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(27, 29, 32)")
+    assert seen["paper"] == ("rgb(27, 29, 32)" if scheme == "dark" else "rgb(255, 255, 255)")
     assert seen["read"] == "frame 10: 20 °" and seen["zoomed"] == ["frame 5", "10"] and seen["whole"] == "frame 0" and seen["open"] >= 6
 
 
