@@ -76,7 +76,9 @@ class RunResults:
 
     def contours(self, view: str) -> Mapping[int, Contour]:
         """The tracked contours of a view, by frame."""
-        return self.cached(f"contours of {view}", lambda: ContourTable(self.out / "contours" / f"{view}.csv")) or {}
+        tables = [self.out / folder / f"{view}.csv" for folder in ("contours", "outlines")]  # of the user, and of the fit's loop
+        path = next((table for table in tables if table.is_file()), tables[0])
+        return self.cached(f"contours of {view}", lambda: ContourTable(path)) or {}
 
     def contour(self, view: str, frame: int) -> Contour | None:
         """The tracked contour in a frame, if there is one."""
@@ -143,7 +145,11 @@ def view_of(clip: bpy.types.MovieClip) -> str:
 
 def _key(scene: bpy.types.Scene) -> tuple[Any, ...]:
     folder, out = project.folder_of(scene), folders.output_folder("", scene)
-    watched = [folder / "take.toml", folder / "rig.toml", *(out / name for name in ("run.json", "frames.csv", "contours", "points2d.csv"))]
+    watched = [
+        folder / "take.toml",
+        folder / "rig.toml",
+        *(out / name for name in ("run.json", "frames.csv", "contours", "outlines", "points2d.csv")),
+    ]
     return folder, out, *(path.stat().st_mtime_ns if path.exists() else 0 for path in watched)
 
 
