@@ -38,18 +38,17 @@ class TRICAP_PT_points(ClipPanel, bpy.types.Panel):
         row = column.row(align=True)
         row.enabled = not busy
         row.operator("tricap.follow_points2d", icon="TRACKING_FORWARDS")
-        self._draw_points(layout, clip, clips, scene.frame_current)
+        _draw_points(layout, clip, clips, scene.frame_current)
 
-    def _draw_points(
-        self, layout: bpy.types.UILayout, clip: bpy.types.MovieClip, clips: dict[str, bpy.types.MovieClip], frame: int
-    ) -> None:
-        shown = {view: set(tracks.points_of(other, frame)) for view, other in clips.items()}
-        column = layout.column(align=True)
-        for name in sorted(set().union(tracks.points_of(clip, frame), *shown.values())):
-            at = [view for view, names in shown.items() if name in names]
-            other = [b if a == name else a for a, b in tracks.joined(clip) if name in (a, b)]
-            words = f"{name}   {' '.join(at)}" + (f"   – {', '.join(other)}" if other else "")
-            column.label(text=words, icon="CHECKMARK" if len(at) > 1 or not clips else "LAYER_USED")
+
+def _draw_points(layout: bpy.types.UILayout, clip: bpy.types.MovieClip, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:
+    shown = {view: set(tracks.points_of(other, frame)) for view, other in clips.items()}
+    column = layout.column(align=True)
+    for name in sorted(set().union(tracks.points_of(clip, frame), *shown.values())):
+        at = [view for view, names in shown.items() if name in names]
+        other = [b if a == name else a for a, b in tracks.joined(clip) if name in (a, b)]
+        words = f"{name}   {' '.join(at)}" + (f"   – {', '.join(other)}" if other else "")
+        column.label(text=words, icon="CHECKMARK" if len(at) > 1 or not clips else "LAYER_USED")
 
 
 CLASSES = (TRICAP_PT_points,)

@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,8 @@ import pytest
 
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.truth import Truth, read_truth
+
+from .layout import Layout
 
 ADDON = "bl_ext.user_default.tricap.addon"
 FRAMES = 4
@@ -144,3 +146,22 @@ def test_clicking_points_is_endless_and_leaves_the_take_alone(scene: Any, truth:
     assert flat.name == "point 2"
     flat.click("C", np.array([30.0, 30.0]))
     assert flat.name == "point 3"
+
+
+def test_the_panel_names_points_views_and_lines(blender: ModuleType, scene: Any, truth: Truth) -> None:
+    """Over a view all buttons, over any other clip those of one image."""
+    clips, panel = module("project").clips_of(scene), module("points.panel").TRICAP_PT_points
+    click(blender, scene, truth, "nose", cloth(truth, 1, 0))
+    click(blender, scene, truth, "chin", cloth(truth, 1, 1), "C")
+    blender.ops.tricap.join_points(clip=clips["C"].name, names="nose\nchin")
+
+    def drawn(clip: Any) -> Layout:
+        here = SimpleNamespace(scene=scene, space_data=SimpleNamespace(clip=clip), window_manager=blender.context.window_manager)
+        return Layout().draw(panel, here)
+
+    over_view = drawn(clips["C"])
+    assert {"tricap.click_points", "tricap.follow_points", "tricap.follow_points2d", "tricap.join_points"} <= set(over_view.operators)
+    assert {"markers", "chosen"} <= set(over_view.properties)
+    assert "nose   L C   – chin" in over_view.texts and "chin   C   – nose" in over_view.texts
+    other = blender.data.movieclips.load(str(next(Path(module("folders").absolute(clips["L"].filepath)).parent.glob("*.png"))))
+    assert "tricap.follow_points" not in drawn(other).operators and "Open footage in this editor." in drawn(None).texts
