@@ -13,6 +13,7 @@ def _modules() -> tuple[ModuleType, ...]:
         jobs,
         operators,
         overlay,
+        points,
         properties,
         reopened,
         retarget,
@@ -20,7 +21,8 @@ def _modules() -> tuple[ModuleType, ...]:
         steps,
     )
 
-    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, editing, steps, reopened, command
+    first = session, jobs, properties, operators, calibrate, retarget, clicking, overlay
+    return *first, points, correcting, editing, steps, reopened, command
 
 
 def register() -> None:

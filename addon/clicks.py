@@ -15,6 +15,7 @@ from ..core.take.take import JOINTS
 from .scene import axes
 
 SURFACE_SEED = re.compile(r"seed (\d+)")
+POINT = re.compile(r"point (\d+)")  # chosen to be followed; no click of the take
 Clicks = dict[str, dict[str, list[float]]]  # name -> view -> [x, y] in full-frame pixels
 
 

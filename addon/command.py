@@ -65,7 +65,8 @@ def add_commands(subparsers: Any) -> None:
         help="play a second action with fewer keys, within this many degrees; the measured one stays in the file",
     )
     parser.add_argument("--colour", choices=("intensity", "sigma", "speed"), default="intensity", help="the colour of the cloud")
-    parser.add_argument("--arrows", action="store_true", help="velocities as arrows")
+    parser.add_argument("--arrows", action="store_true", help="velocities and accelerations as arrows")
+    parser.add_argument("--removed", action="store_true", help="also what the filters removed from the trajectories, coloured by reason")
     parser.set_defaults(run=scene)
 
 
@@ -89,7 +90,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         from .scene.preview import preview, turntable
 
         _check(args)
-        contents = read_contents(args.out, monitor, skins=args.exact_skin)
+        contents = read_contents(args.out, monitor, skins=args.exact_skin, removed=args.removed)
         first, last = contents.frames
         if args.frame is not None and not first <= args.frame <= last:
             raise InputError(f"--frame {args.frame} is not among the frames {first} to {last}; choose another.")

@@ -15,7 +15,7 @@ from ..core.foundation import settings as knobs
 from ..core.run.settings import SETTINGS, settings_of
 from . import take_properties
 from .editing import foot_lock, uncertainty
-from .scene import footage_plane, metaballs, standing
+from .scene import footage_plane, layers, metaballs, standing
 from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -145,6 +145,14 @@ def register() -> None:
             get=lambda group: metaballs.shown(group.id_data),
             set=lambda group, value: metaballs.show(group.id_data, value),
             description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
+        ),
+        "body_layer": bpy.props.EnumProperty(
+            name="Layer",
+            items=list(layers.LAYERS),
+            options=set(),
+            get=lambda group: [name for name, *_ in layers.LAYERS].index(layers.shown(group.id_data)),
+            set=lambda group, value: layers.show(group.id_data, layers.LAYERS[value][0]),
+            description="Show the layers of the body one after the other: skeleton, metaballs by kind, polygons, skin",
         ),
         "show_uncertainty": bpy.props.BoolProperty(
             name="Show Uncertainty",

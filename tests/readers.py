@@ -51,7 +51,7 @@ from tricap.core.take.clock import read_timestamps
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 from tricap.core.tracking.contour import ContourTable
-from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
+from tricap.core.tracking.point_tables import read_key_points, read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackStatus
 
 __all__ = ["FAULTY", "READERS", "InputError"]
@@ -131,6 +131,14 @@ def residual_motion() -> str:
             chains=(chain,),
         )
     )
+
+
+def key_point_files(folder: Path) -> list[Path]:
+    """The tables of two followed points."""
+    space, images = folder / "points3d.csv", folder / "points2d.csv"
+    space.write_text("frame,time_s,point,x,y,z,sigma,status\n0,0.0,a,1,2,3,0.001,measured\n1,0.04,a,,,,,lost\n", encoding="utf-8")
+    images.write_text("frame,view,point,x,y\n0,L,a,10,12\n0,C,a,20,12.5\n", encoding="utf-8")
+    return [space, images]
 
 
 def text(name: str, content: str) -> Make:
@@ -381,6 +389,7 @@ READERS: dict[str, tuple[Make, Read]] = {
                       lambda f: read_points(f / "points.csv")),
     "2-D tracks": (text("a.csv", "frame,point,x,y,sigma,correlation,status\n0,a,10,12,0.1,0.9,measured\n1,a,11,12,,,lost\n"),
                    lambda f: read_planar(f / "a.csv")),
+    "followed points": (key_point_files, lambda f: read_key_points(f / "points3d.csv", f / "points2d.csv")),
     "bar": (bar_file, lambda f: read_bar(f / "rig.toml", RIG)),
     "chosen points in views": (text("points.csv", "point,view,x,y\na,L,10,12\na,C,20,30\n"),
                                lambda f: read_points(f / "points.csv", with_views=True)),

@@ -74,8 +74,8 @@ class ClickSession:
 
     @property
     def endless(self) -> bool:
-        """Whether surface seeds are clicked, whose number is unlimited."""
-        return clicks.SURFACE_SEED.fullmatch(self.names[0]) is not None
+        """Whether surface seeds or single points are clicked, whose number is unlimited."""
+        return any(kind.fullmatch(self.names[0]) for kind in (clicks.SURFACE_SEED, clicks.POINT))
 
     @property
     def has_all_clips(self) -> bool:

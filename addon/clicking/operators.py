@@ -35,6 +35,14 @@ class ClickOperator:
         """The names to click, in order."""
         raise NotImplementedError
 
+    def begin(self, context: bpy.types.Context) -> tuple[ClickSession, str]:
+        """The session, and a warning or "".
+
+        Raises:
+            InputError: there is no footage, or nothing to click.
+        """
+        return begin_session(context.scene, self.names)
+
     def follow(self, context: bpy.types.Context) -> None:
         """React to a change of the scene's frame."""
         self.session.show_frame(context.scene.frame_current)
@@ -45,7 +53,7 @@ class ClickOperator:
             self.report({"WARNING"}, "Clicking is already active. Press Esc in a view to finish it.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         try:
-            self.session, warning = begin_session(context.scene, self.names)
+            self.session, warning = self.begin(context)
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return {"CANCELLED"}
@@ -277,8 +285,8 @@ class Click(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def begin_session(scene: bpy.types.Scene, names: Any) -> tuple[ClickSession, str]:
-    """A session for the scene's current frame, and a warning or "".
+def begin_session(scene: bpy.types.Scene, names: Any, *, seeds: bool = True) -> tuple[ClickSession, str]:
+    """A session for the scene's current frame, and a warning or "". Clicks of `seeds` belong to the take, those of single points do not.
 
     Raises:
         InputError: there is no footage, or no model to click joints of.
@@ -288,7 +296,8 @@ def begin_session(scene: bpy.types.Scene, names: Any) -> tuple[ClickSession, str
         raise InputError("Add footage first: there is no view to click in.")
     wanted = names(bpy.context, clips)
     finder, warning = make_finder(scene)
-    set_click_frame(scene, clips, scene.frame_current)
+    if seeds:
+        set_click_frame(scene, clips, scene.frame_current)
     session = ClickSession(clips, wanted, scene.frame_current, finder, _depths(scene))
     if not session.name:  # all are clicked: begin with the first, to check or correct them
         session.go_to(session.names[0])

@@ -86,14 +86,23 @@ class BuildScene(JobOperator, bpy.types.Operator):
         description="Play an action with fewer keyframes, within this angle of the measured one, which is kept. 0: play the measured one",
     )
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
-    arrows: bpy.props.BoolProperty(name="Velocity Arrows", default=False)  # type: ignore[valid-type]
+    arrows: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Velocity Arrows",
+        default=False,
+        description="Show the velocity (per 0.1 s) and the acceleration of every tracked point as arrows",
+    )
+    removed: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Removed Trajectories",
+        default=False,
+        description="Also show what the filters removed from the trajectories, coloured by reason",
+    )
 
     def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], Contents]":
         """The folder with the results."""
         from ..scene.contents import read_contents
 
-        out, skins = folders.output_folder(self.out, context.scene), self.exact_skin
-        return lambda monitor: read_contents(out, monitor, skins=skins)
+        out, skins, removed = folders.output_folder(self.out, context.scene), self.exact_skin, self.removed
+        return lambda monitor: read_contents(out, monitor, skins=skins, removed=removed)
 
     def finish(self, context: bpy.types.Context, result: "Contents") -> set[str]:
         """Build the scene from what was read."""

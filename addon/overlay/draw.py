@@ -79,7 +79,10 @@ def _draw() -> None:
 
 def is_anything_shown(shown: Any, frame: int) -> bool:
     """Whether an overlay is switched on, or something is inspected in this frame."""
-    return bool(shown.points or shown.tracks or shown.contour or shown.body or shown.graph) or shown_inspection(frame) is not None
+    return (
+        bool(shown.points or shown.tracks or shown.contour or shown.body or shown.chosen or shown.graph)
+        or shown_inspection(frame) is not None
+    )
 
 
 def draw_overlays(run: RunResults, shown: Any, view: str, frame: int, sheet: Canvas, *, playing: bool = False) -> None:
@@ -90,6 +93,8 @@ def draw_overlays(run: RunResults, shown: Any, view: str, frame: int, sheet: Can
             legend += _draw_points(run, view, frame, shown, sheet)
         if shown.tracks:
             legend += _draw_tracks(run, view, frame, shown)
+        if shown.chosen:
+            legend += _draw_chosen(run, view, frame, sheet)
         if shown.contour:
             legend += _draw_contour(run, view, frame)
         if shown.body and (not playing or run.has(("outline", view, frame))):  # it takes a tenth of a second
@@ -154,6 +159,18 @@ def _draw_tracks(run: RunResults, view: str, frame: int, shown: Any) -> list[tup
     reasons = ", ".join(f"{words} {count}" for words, count in layers.removal_counts(history, frame, by)[:4])
     kept = [("kept trajectories", (*layers.KEPT, 1.0))] if which == "both" else []
     return [*kept, (f"removed: {reasons or 'none in this frame'}", (*layers.REMOVED, 1.0))]
+
+
+def _draw_chosen(run: RunResults, view: str, frame: int, sheet: Canvas) -> list[tuple[str, Colour]]:
+    """The paths of single points, and crosses where they are."""
+    segments, colours, at = run.cached(("chosen paths", view, frame), lambda: layers.chosen_paths(run, view, frame))
+    if len(segments):
+        canvas.draw_lines(run.cached(("chosen batch", view, frame), lambda: canvas.line_batch(segments, colours)), LINE_PX)
+    if not at:
+        return [("no followed points in this frame", PROBLEM)]
+    crosses = np.concatenate([canvas.cross(xy, 7.0 / sheet.zoom, 2.0 / sheet.zoom) for xy in at.values()])
+    canvas.draw_lines(canvas.line_batch(crosses), 1.5, WHITE)
+    return [(f"followed points: {', '.join(at)}", WHITE)]
 
 
 def _draw_contour(run: RunResults, view: str, frame: int) -> list[tuple[str, Colour]]:

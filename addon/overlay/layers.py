@@ -87,6 +87,21 @@ def tails(run: "RunResults", view: str, frame: int, length: int, which: str, by:
     return np.concatenate([segments for (segments, _, _), _ in parts]), np.concatenate(colours)
 
 
+def chosen_paths(run: "RunResults", view: str, frame: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Segments (M, 2, 2) of the paths of single points up to a frame, their colours (M, 4), and the points' pixels in it by name."""
+    table = run.chosen()
+    if table is None or view not in table.views:
+        return np.zeros((0, 2, 2)), np.zeros((0, 4)), {}
+    rows = np.flatnonzero(table.frames <= frame)
+    xy = table.xy_px[rows, :, table.views.index(view)]
+    steps = np.stack([xy[:-1], xy[1:]], axis=2)  # (T − 1, N, 2, 2)
+    known = np.isfinite(steps).all(axis=(2, 3)) & (np.diff(table.frames[rows]) == 1)[:, None]
+    tints = heat_colours((np.arange(len(table.names)) + 0.5) / max(len(table.names), 1))
+    now = xy[-1] if len(rows) and table.frames[rows[-1]] == frame else np.full((len(table.names), 2), np.nan)
+    at = {name: place for name, place in zip(table.names, now) if np.isfinite(place).all()}
+    return steps[known], np.broadcast_to(tints, (*known.shape, 4))[known], at
+
+
 def removal_counts(history: "TrackHistory", frame: int, by: str = ALL) -> list[tuple[str, int]]:
     """Why positions were removed from a frame, and how many for each reason, the most frequent first."""
     now = np.flatnonzero(history.frames == frame)

@@ -16,7 +16,7 @@ from ..session import get_session
 from . import canvas, draw, layers, results
 
 if TYPE_CHECKING:
-    from ...core.cli.contour import Start
+    from ...core.run.outlines import Start
 
 REACH_SCREEN_PX = 14.0  # around the pointer
 
@@ -98,7 +98,7 @@ class FollowContours(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], list[str]]:
         """Read folders and settings; write the project's take.toml."""
-        from ...core.cli.contour import Start
+        from ...core.run.outlines import Start
 
         take, out, overrides = project.chosen(context.scene, "", "")
         view, start = self.view, Start(body=self.from_body)

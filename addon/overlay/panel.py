@@ -44,6 +44,7 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
         column.prop(shown, "contour")
         if shown.contour:
             self._draw_contour(column, context, run)
+        column.prop(shown, "chosen")
         column.prop(shown, "graph")
         layout.operator("tricap.look_closer", icon="VIEWZOOM")
         if shown.contour:

@@ -51,6 +51,7 @@ class TricapOverlay(bpy.types.PropertyGroup):
     tail: bpy.props.IntProperty(name="Tail", description="Length of the paths in frames", default=8, min=1, max=200, update=_changed)  # type: ignore[valid-type]
     contour: _switch("Outline", "The tracked outline of the person")  # type: ignore[valid-type]
     body: _switch("Fitted Body", "The outline of the fitted body's skin")  # type: ignore[valid-type]
+    chosen: _switch("Followed Points", "The paths of the points that were clicked and followed")  # type: ignore[valid-type]
     graph: _switch("Quality Graph", "Residuals and sigmas of all frames; doubtful frames are red")  # type: ignore[valid-type]
 
 

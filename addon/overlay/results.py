@@ -24,7 +24,9 @@ from ..session import OpenResults, get_session
 if TYPE_CHECKING:
     from ...core.run.inspection import FramePoints, TrackHistory
     from ...core.run.record import FrameTable
+    from ...core.tracking.point_tables import KeyPointTable
 
+POINTS = ("points3d.csv", "points2d.csv")  # tables of single points
 CACHED_FRAMES = 48  # things of single frames that are cached at most
 
 
@@ -59,6 +61,13 @@ class RunResults:
 
         return self.cached("tracks", lambda: read_tracks(self.out))
 
+    def chosen(self) -> "KeyPointTable | None":
+        """The single points that were followed, if there are any."""
+        from ...core.tracking.point_tables import read_key_points
+
+        space, images = (self.out / name for name in POINTS)
+        return self.cached("chosen", lambda: read_key_points(space, images) if space.is_file() and images.is_file() else None)  # type: ignore[no-any-return]
+
     def outline(self, view: str, frame: int) -> list[Any]:
         """The fitted body's outline."""
         from ...core.run.inspection import body_outline
@@ -67,7 +76,9 @@ class RunResults:
 
     def contours(self, view: str) -> Mapping[int, Contour]:
         """The tracked contours of a view, by frame."""
-        return self.cached(f"contours of {view}", lambda: ContourTable(self.out / "contours" / f"{view}.csv")) or {}
+        tables = [self.out / folder / f"{view}.csv" for folder in ("contours", "outlines")]  # of the user, and of the fit's loop
+        path = next((table for table in tables if table.is_file()), tables[0])
+        return self.cached(f"contours of {view}", lambda: ContourTable(path)) or {}
 
     def contour(self, view: str, frame: int) -> Contour | None:
         """The tracked contour in a frame, if there is one."""
@@ -134,15 +145,20 @@ def view_of(clip: bpy.types.MovieClip) -> str:
 
 def _key(scene: bpy.types.Scene) -> tuple[Any, ...]:
     folder, out = project.folder_of(scene), folders.output_folder("", scene)
-    watched = [folder / "take.toml", folder / "rig.toml", *(out / name for name in ("run.json", "frames.csv", "contours"))]
+    watched = [
+        folder / "take.toml",
+        folder / "rig.toml",
+        *(out / name for name in ("run.json", "frames.csv", "contours", "outlines", "points2d.csv")),
+    ]
     return folder, out, *(path.stat().st_mtime_ns if path.exists() else 0 for path in watched)
 
 
 def _open(scene: bpy.types.Scene) -> RunResults:
     folder, out = project.folder_of(scene), folders.output_folder("", scene)
-    if not (out / "run.json").is_file():
+    if not (out / "run.json").is_file() and not (out / POINTS[0]).is_file():
         raise InputError("Nothing was measured yet.")
-    footage, run = open_take(read_take(folder)), read_run(out / "run.json")
+    footage = open_take(read_take(folder))
+    run = read_run(out / "run.json") if (out / "run.json").is_file() else {}  # single points are followed without a run
     matching = run.get("settings", {}).get("matching", {})
     patch = from_table(MatchingSettings, {name: v for name, v in matching.items() if name == "patch_px"}, "[matching] of run.json")
     cameras = {view.name: camera for view, camera in zip(footage.take.views, footage.rig.cameras)}

@@ -13,6 +13,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import ARM, LEG, SIDES, sided
 from ...core.motion.retarget.transfer import body_axes
+from ..scene import layers
 
 COLUMNS = 8  # frames
 CELL_PX = (190, 270)
@@ -115,7 +116,7 @@ def _skin_points(armature_object: bpy.types.Object, frame: float) -> np.ndarray:
     scene = bpy.context.scene
     scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1.0))
     graph, found = bpy.context.evaluated_depsgraph_get(), [np.zeros((0, 3))]
-    for skin in [o for o in scene.objects if o.type == "MESH"]:
+    for skin in [o for o in scene.objects if o.type == "MESH" and not layers.is_ellipsoids(o)]:
         if armature_object not in (m.object for m in skin.modifiers if m.type == "ARMATURE"):
             continue
         mesh = skin.evaluated_get(graph).data

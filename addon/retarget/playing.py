@@ -19,6 +19,7 @@ from ...core.foundation.progress import Monitor
 from ...core.motion.formats.markers import Markers
 from ...core.motion.formats.ply import write_mesh
 from ...core.motion.retarget.rig import Motion, Rig
+from ..scene import layers
 from ..scene.armature import JOINTS_KEY
 from .read import read_rig, reading_motion
 
@@ -103,7 +104,8 @@ def points_of_played(armature_object: bpy.types.Object, motion: Motion) -> Marke
 
 def skins_of(armature_object: bpy.types.Object) -> list[bpy.types.Object]:
     """The meshes that the armature deforms or carries: those that are visible or rendered, or all if none is."""
-    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and (_deforming(o, armature_object) or _carrier(o, armature_object))]
+    bound = [o for o in bpy.context.scene.objects if o.type == "MESH" and (_deforming(o, armature_object) or _carrier(o, armature_object))]
+    meshes = [o for o in bound if not layers.is_ellipsoids(o)]
     return [o for o in meshes if o.visible_get() or not o.hide_render] or meshes
 
 

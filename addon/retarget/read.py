@@ -17,6 +17,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
+from ..scene import layers
 from ..scene.armature import ROLES_KEY
 from ..scene.standing import curves_of
 
@@ -150,7 +151,7 @@ def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> 
     instead = rig_map.control_rig.skin if rig_map.control_rig is not None else {}
     meant = {instead.get(name, name): name for name in wanted}
     points: dict[str, list[np.ndarray]] = {}
-    for skin in [o for o in bpy.data.objects if o.type == "MESH"]:
+    for skin in [o for o in bpy.data.objects if o.type == "MESH" and not layers.is_ellipsoids(o)]:
         if armature_object not in (modifier.object for modifier in skin.modifiers if modifier.type == "ARMATURE"):
             continue
         groups = {group.index: meant[group.name] for group in skin.vertex_groups if group.name in meant}

@@ -24,12 +24,12 @@ from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, footage_plane, metaballs, nodes, skin, standing, surroundings
+from . import action, armature, cameras, clips, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
-from .trajectories import add_arrows, add_trajectories, sparser
+from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser
 
 COLLECTION = "Tricap"
 MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
@@ -334,6 +334,9 @@ def _add_trajectories(
     _name_segments(add_trajectories(collection, shown), contents)
     if options.arrows:
         add_arrows(collection, shown)
+        add_bends(collection, shown)
+    if contents.raw is not None:
+        add_removed(collection, contents.raw, options.most_points)
     return int(shown["xyz_m"].shape[1])
 
 
@@ -380,6 +383,8 @@ def _add_body(
     armature_object.data[REST_POSE_KEY] = options.rest_pose
     flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
+    if len(shape.metaballs.weight):
+        layers.add_ellipsoids(collection, armature_object, shape, stand.lift_m if stand is not None else 0.0)
     try:
         like = contents.prepared.skin
         prepared = like and skin.in_rest_pose(like, measured_shape, shape)
@@ -396,6 +401,7 @@ def _add_body(
         for other in {*flesh, skin_object} - {shown}:  # they coincide with the surface that is shown
             other.hide_render = True
         skin_object.hide_set(skin_object is not shown)
+        shown[layers.LAYER_KEY] = layers.SKIN
         metaballs.show(bpy.context.scene, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:

@@ -27,6 +27,7 @@ from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
 from ...core.take.footage import Footage, open_take
 from ...core.take.take import read_take
+from ...core.tracking.settings import TrackStatus
 from .prepare import Prepared, prepare
 
 DEFAULT_FPS = 25.0  # of a scene whose take is missing
@@ -50,6 +51,7 @@ class Contents:
     footage: Footage | None = None
     clouds: Mapping[int, Ply] = field(default_factory=dict)
     trajectories: Mapping[str, np.ndarray] | None = None
+    raw: Mapping[str, np.ndarray] | None = None  # the trajectories before the filters, only on request
     shape: BodyShape | None = None
     motion: MotionTable | None = None  # radians, metres
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
@@ -73,8 +75,9 @@ class Contents:
         return (int(min(known)), int(max(known))) if known else (0, 0)
 
 
-def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Contents:
-    """Read the folder OUT of a run, and the take it was made from; on request also the skin of every frame.
+def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: bool = False) -> Contents:
+    """Read the folder OUT of a run, and the take it was made from; on request also the skin of every frame, and trajectories as they were
+    before the filters.
 
     Raises:
         InputError: OUT is no folder of results, or a file in it is damaged.
@@ -102,6 +105,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
         footage=footage,
         clouds=clouds,
         trajectories=trajectories,
+        raw=_optional(out / "trajectories_raw.npz", "removed trajectories", _raw, warnings) if removed else None,
         shape=person,
         motion=motion,
         skin_settings=settings,
@@ -175,5 +179,14 @@ def _motion(path: Path, shape: BodyShape | None, warnings: list[str]) -> MotionT
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     arrays, _ = store.load(path)
-    store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), velocity_m_s=("f", "TN3"), sigma_m=("f", "TN"))
+    vectors = dict.fromkeys(("xyz_m", "velocity_m_s", "acceleration_m_s2"), ("f", "TN3"))
+    store.check_layout(path, arrays, frames=("iu", "T"), sigma_m=("f", "TN"), **vectors)
+    return arrays
+
+
+def _raw(path: Path) -> dict[str, np.ndarray]:
+    arrays, _ = store.load(path)
+    store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), status=("iu", "TN"))
+    if not np.isin(arrays["status"], list(TrackStatus)).all():
+        raise InputError(f"{path} is damaged (invalid states); run the tracking again.")
     return arrays

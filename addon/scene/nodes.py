@@ -139,6 +139,17 @@ def heat_material(name: str, attribute: str, largest: float) -> bpy.types.Materi
     return material
 
 
+def coloured_material(name: str, attribute: str) -> bpy.types.Material:
+    """The colours (vectors of red, green and blue) of an attribute."""
+    material = bpy.data.materials.new(name)
+    material.diffuse_color = (0.9, 0.25, 0.2, 1.0)
+    shader = _shader(material)
+    value = material.node_tree.nodes.new("ShaderNodeAttribute")
+    value.attribute_name = attribute
+    material.node_tree.links.new(value.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
 def tree_of(material: bpy.types.Material) -> bpy.types.NodeTree:
     """The nodes of a material."""
     if bpy.app.version < (5, 0, 0):  # later versions always use nodes, and warn about this

@@ -21,7 +21,7 @@ class SceneOptions:
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
     simplify_deg: float = 0.0  # above 0: the armature plays a second action with fewer keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
-    arrows: bool = False  # velocities as arrows
+    arrows: bool = False  # velocities and accelerations as arrows
     studio: bool = True  # lights, floor and background
     frame: int | None = None  # of the implicit surface; None: the middle one
     most_points: int = 300_000  # of the cloud, and of the trajectories, in all frames together; more are thinned evenly

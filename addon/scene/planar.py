@@ -26,9 +26,10 @@ HIDDEN = ("hide_viewport", "hide_render")
 
 
 def add_planar(
-    scene: bpy.types.Scene, table: PlanarTable, joined: Sequence[tuple[str, str]], footage: ImageSequence | None
+    scene: bpy.types.Scene, table: PlanarTable, joined: Sequence[tuple[str, str]], footage: ImageSequence | None, first: int = 0
 ) -> bpy.types.Collection:
-    """A new collection with the points of a table, the curves that join them by name, and the footage where there is one.
+    """A new collection with the points of a table, the curves that join them by name, and the footage where there is one, whose image 0 is
+    shown in frame `first`.
 
     A point is hidden in frames where it was not tracked, and a curve where one of its points is hidden.
 
@@ -43,7 +44,7 @@ def add_planar(
     collection.objects.link(picture)
     picture.rotation_euler.x = pi / 2
     if footage is not None:
-        _show(picture, footage, images)
+        _show(picture, footage, images, first)
     tracked = np.isfinite(table.xy_px).all(axis=2)
     positions = on_picture(table.xy_px, size)
     points = [_point(collection, picture, name, table.frames, positions[:, n], tracked[:, n]) for n, name in enumerate(table.names)]
@@ -72,12 +73,12 @@ def _images(footage: ImageSequence) -> bpy.types.Image:
     return images
 
 
-def _show(picture: bpy.types.Object, footage: ImageSequence, images: bpy.types.Image) -> None:
-    """Image n of the footage in frame n of the scene."""
+def _show(picture: bpy.types.Object, footage: ImageSequence, images: bpy.types.Image, first: int) -> None:
+    """Image n of the footage in frame n + `first` of the scene."""
     picture.empty_display_type, picture.empty_display_size = "IMAGE", 1.0
     picture.data = images
     user, number = picture.image_user, re.search(r"(\d+)\D*$", Path(footage.files()[0]).stem)
-    user.frame_start, user.frame_duration = 0, footage.count
+    user.frame_start, user.frame_duration = first, footage.count
     user.frame_offset = int(number[1]) - 1 if picture.data.source == "SEQUENCE" and number else 0
     user.use_auto_refresh = True
 

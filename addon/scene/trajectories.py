@@ -9,20 +9,26 @@ from collections.abc import Mapping
 import bpy
 import numpy as np
 
+from ...core.tracking.reasons import REASON_COLOURS
+from ...core.tracking.settings import TrackStatus
 from . import nodes
 from .cloud import write
 
-NAME, ARROWS_NAME = "Trajectories", "Velocities"
+NAME, ARROWS_NAME, BENDS_NAME, REMOVED_NAME = "Trajectories", "Velocities", "Accelerations", "Removed trajectories"
 ARROW_S = 0.1  # an arrow has the length of the path in this time
+BEND_S2 = 0.02  # an arrow of an acceleration is it times this
 BARB = 0.25  # length of an arrow's barbs, as a fraction of it
 TRAIL_FRAMES = 10
 TRAIL_RADIUS_M = 0.0006
 REDDEST_SPEED_M_S = 2.0  # painted red
+REDDEST_M_S2 = 20.0  # painted red
 
 
-def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
-    """One object from the arrays of trajectories.npz and the bones of their points: frames (T,), xyz_m (T, N, 3) with NaN = not visible,
-    velocity_m_s, sigma_m (T, N), segment (T, N)."""
+def add_trajectories(
+    collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], trail: int = TRAIL_FRAMES, radius_m: float = TRAIL_RADIUS_M
+) -> bpy.types.Object:
+    """One object, whose trails are `trail` frames long and `radius_m` thick, from the arrays of trajectories.npz and the bones of their
+    points: frames (T,), xyz_m (T, N, 3) with NaN = not visible, velocity_m_s, sigma_m (T, N), segment (T, N)."""
     xyz, frames = arrays["xyz_m"], arrays["frames"]
     visible = np.isfinite(xyz).all(axis=-1)  # (T, N)
     row, track = np.nonzero(visible)
@@ -47,7 +53,7 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     mesh.materials.append(material)
     trail_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(trail_object)
-    trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material)
+    trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material, trail, radius_m)
     return trail_object
 
 
@@ -57,17 +63,63 @@ def sparser(arrays: Mapping[str, np.ndarray], most: int) -> tuple[Mapping[str, n
     return (arrays if k == 1 else {name: a[:, ::k] if a.ndim > 1 else a for name, a in arrays.items()}), k
 
 
+def add_removed(collection: bpy.types.Collection, raw: Mapping[str, np.ndarray], most: int) -> bpy.types.Object:
+    """One object with what the filters removed, from the arrays of trajectories_raw.npz (frames, xyz_m, status), coloured by reason as in
+    the report; of more than `most` positions every n-th trajectory. Attributes of the points: frame, track, reason (TrackStatus)."""
+    gone = np.isfinite(raw["xyz_m"]).all(axis=-1) & (raw["status"] != TrackStatus.MEASURED)
+    every = -(-int(gone.sum()) // most) or 1
+    xyz, status, gone = raw["xyz_m"][:, ::every], raw["status"][:, ::every], gone[:, ::every]
+    ends = gone.copy()
+    ends[:-1] |= gone[1:] & np.isfinite(xyz[:-1]).all(axis=-1)  # a line goes on from the last position that was kept
+    row, track = np.nonzero(ends)
+    index = np.full(ends.shape, -1)
+    index[row, track] = np.arange(len(row))
+    joined = ends[:-1] & gone[1:] & (np.diff(raw["frames"]) == 1)[:, None]
+    edges = np.stack([index[:-1][joined], index[1:][joined]], axis=-1)
+    mesh = bpy.data.meshes.new(REMOVED_NAME)
+    mesh.vertices.add(len(row))
+    mesh.edges.add(len(edges))
+    mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, dtype=np.int32).ravel())
+    write(mesh, "position", "FLOAT_VECTOR", xyz[ends])
+    write(mesh, "frame", "INT", raw["frames"][row])
+    write(mesh, "track", "INT", every * track)
+    write(mesh, "reason", "INT", status[ends])
+    table = np.tile(np.array([0.3, 0.3, 0.3]), (max(TrackStatus) + 1, 1))
+    for reason, bgr in REASON_COLOURS.items():
+        table[reason] = (np.array(bgr[::-1]) / 255) ** 2.2
+    write(mesh, "colour", "FLOAT_VECTOR", table[status[ends]])
+    mesh.update()
+    material = nodes.coloured_material(REMOVED_NAME, "colour")
+    mesh.materials.append(material)
+    removed = bpy.data.objects.new(REMOVED_NAME, mesh)
+    collection.objects.link(removed)
+    removed.modifiers.new("Trail", "NODES").node_group = trail_group(material)
+    return removed
+
+
+def add_bends(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+    """The accelerations as arrows; see `add_arrows`."""
+    return _arrows(collection, arrays, BENDS_NAME, arrays["acceleration_m_s2"], BEND_S2, REDDEST_M_S2)
+
+
 def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
     """One object with an arrow for the velocity of every point in every frame; the viewport shows those of the current frame."""
-    has_velocity = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(arrays["velocity_m_s"]).all(axis=-1)
-    row, _ = np.nonzero(has_velocity)
-    at, velocity = arrays["xyz_m"][has_velocity], arrays["velocity_m_s"][has_velocity]
-    arrow = ARROW_S * velocity
+    return _arrows(collection, arrays, ARROWS_NAME, arrays["velocity_m_s"], ARROW_S, REDDEST_SPEED_M_S)
+
+
+def _arrows(
+    collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], name: str, vectors: np.ndarray, scale: float, reddest: float
+) -> bpy.types.Object:
+    """Arrows of `vectors` (T, N, 3) times `scale` at the points, with their size as the attribute speed."""
+    known = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(vectors).all(axis=-1)
+    row, _ = np.nonzero(known)
+    at, velocity = arrays["xyz_m"][known], vectors[known]
+    arrow = scale * velocity
     aside = np.cross(arrow, [0.0, 1.0, 0.0])
     aside *= 0.5 * BARB * np.linalg.norm(arrow, axis=1, keepdims=True) / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
     corners = np.stack([at, at + arrow, at + (1 - BARB) * arrow + aside, at + (1 - BARB) * arrow - aside], axis=1)
     edges = 4 * np.arange(len(at))[:, None, None] + np.array([[0, 1], [1, 2], [1, 3]])
-    mesh = bpy.data.meshes.new(ARROWS_NAME)
+    mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(4 * len(at))
     mesh.edges.add(3 * len(at))
     mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, dtype=np.int32).ravel())
@@ -75,15 +127,15 @@ def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray
     write(mesh, "frame", "INT", np.repeat(arrays["frames"][row], 4))
     write(mesh, "speed", "FLOAT", np.repeat(np.linalg.norm(velocity, axis=1), 4))
     mesh.update()
-    material = nodes.heat_material(ARROWS_NAME, "speed", REDDEST_SPEED_M_S)
+    material = nodes.heat_material(name, "speed", reddest)
     mesh.materials.append(material)
-    arrows_object = bpy.data.objects.new(ARROWS_NAME, mesh)
+    arrows_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(arrows_object)
     arrows_object.modifiers.new("Current frame", "NODES").node_group = trail_group(material, 0)
     return arrows_object
 
 
-def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy.types.NodeTree:
+def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES, radius_m: float = TRAIL_RADIUS_M) -> bpy.types.NodeTree:
     """Geometry nodes: the edges of the last `Trail` frames before the current one, as thin tubes."""
     group, group_input, group_output = nodes.new_group("Tricap trail")
     trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
@@ -98,7 +150,7 @@ def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy
     curve = nodes.add(group, "GeometryNodeMeshToCurve")
     profile = nodes.add(group, "GeometryNodeCurvePrimitiveCircle")
     profile.inputs["Resolution"].default_value = 3
-    nodes.active(profile.inputs, "Radius").default_value = TRAIL_RADIUS_M
+    nodes.active(profile.inputs, "Radius").default_value = radius_m
     tube = nodes.add(group, "GeometryNodeCurveToMesh")
     paint_node = nodes.add(group, "GeometryNodeSetMaterial")
     paint_node.inputs["Material"].default_value = material

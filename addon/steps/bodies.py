@@ -16,7 +16,7 @@ from ..operators import control_rig
 from ..panels import sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
-from ..scene import footage_plane, metaballs, standing
+from ..scene import footage_plane, layers, metaballs, standing
 from . import check, states, watch
 from .person import draw_person
 from .states import Fix, Status
@@ -212,6 +212,8 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
         editing.draw(layout, edited)
     if next(footage_plane.screens(context.scene), None) is not None:
         layout.prop(context.scene.tricap, "render_footage")
+    if layers.parts(context.scene):
+        layout.row(align=True).prop(context.scene.tricap, "body_layer", expand=True)
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

@@ -18,6 +18,7 @@ import numpy as np
 from ..foundation import bounded, store
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
+from .anatomy import ball_names
 from .metaballs import ACROSS, VISIBLE, Metaballs, field_and_derivatives, three_balls
 from .model_file import BodyModel, base_dofs, dof_from_table
 from .skeleton import Bone, Skeleton, bone_frames
@@ -202,9 +203,12 @@ def write_body(path: Path, shape: BodyShape) -> None:
             "",
         ]
     balls = shape.metaballs
+    names = ball_names([bone.name for bone in skeleton.bones], balls.bone_index)
     for i, bone_index in enumerate(balls.bone_index):
         lines += [
             "[[metaballs]]",
+            f"name = {_text(names[i].name)}",
+            f"kind = {_text(names[i].kind)}",
             f"bone = {_text(skeleton.bones[bone_index].name)}",
             f"centre = {balls.centre[i].tolist()!r}  # in bone lengths, in the bone's axes",
             f"radii_m = {balls.radii_m[i].tolist()!r}  # l of the field exp(-2 d), not the visible radius",

@@ -13,6 +13,7 @@ from ..foundation.settings import from_table
 from ..images.interlace import row_grid
 from ..images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
 from ..matching.least_squares import MatchingSettings
+from ..run.settings import Overrides
 from ..tracking.planar import PlanarTracks, track_planar
 from ..tracking.point_tables import ChosenPoints, read_points, write_planar
 from ..tracking.settings import TrackingSettings, TrackStatus
@@ -32,9 +33,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     tables = overrides(args.set)
     if set(tables) - {"matching", "tracking"}:
         raise InputError("--set of track2d accepts settings of the groups matching and tracking only.")
-    matching = from_table(MatchingSettings, {"min_correlation": MIN_CORRELATION, "max_sigma_px": MAX_SIGMA_PX,
-                                             **tables.get("matching", {})}, "[matching]")  # fmt: skip
-    tracking = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
+    matching, tracking = settings_of_2d(tables)
     points, sequence = read_points(args.points), open_footage(args.sequence)
     check_not_read("--out", args.out, args.points, args.sequence)
     if args.pictures is not None:
@@ -49,6 +48,37 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         _draw(args.pictures, sequence, points, tracks, monitor)
     whole = int((tracks.status == TrackStatus.MEASURED).all(axis=0).sum())
     return [f"{args.out}: {len(points.names)} points over {len(frames)} frames, {whole} of them visible in every frame."]
+
+
+def settings_of_2d(tables: Overrides) -> tuple[MatchingSettings, TrackingSettings]:
+    """The settings of the 2-D mode, with its own defaults.
+
+    Raises:
+        InputError: an unknown name, or a value that cannot be.
+    """
+    own = {"min_correlation": MIN_CORRELATION, "max_sigma_px": MAX_SIGMA_PX}
+    matching: MatchingSettings = from_table(MatchingSettings, {**own, **tables.get("matching", {})}, "[matching]")
+    tracking: TrackingSettings = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
+    return matching, tracking
+
+
+def track_both_ways(
+    sequence: ImageSequence,
+    xy_px: np.ndarray,
+    first: int,
+    matching: MatchingSettings,
+    tracking: TrackingSettings,
+    monitor: Monitor,
+    interlaced: str = "none",
+) -> PlanarTracks:
+    """Track points (N, 2) of image `first` to the end of the sequence, and back to its beginning."""
+    grid = row_grid(interlaced)
+    ahead = track_planar(sequence.read, range(first, sequence.count), xy_px, matching, tracking, monitor, grid)
+    if first == 0:
+        return ahead
+    back = track_planar(sequence.read, range(first, -1, -1), xy_px, matching, tracking, monitor, grid)
+    names = PlanarTracks.__dataclass_fields__
+    return PlanarTracks(**{name: np.concatenate([getattr(back, name)[:0:-1], getattr(ahead, name)]) for name in names})
 
 
 def open_footage(path: Path) -> ImageSequence:

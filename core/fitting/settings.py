@@ -45,6 +45,12 @@ class FitSettings:
         True, "Tracked points stay at their places in the limbs: they determine twist, sliding, centres of the joints."
     )
     track_again: bool = knob(False, "Track once more with the fitted body, which predicts where and when lost points reappear.")
+    closed_loop: str = knob(
+        "auto",
+        "After the fit, track once more with the body, and fit again: to the longer trajectories (tracks), and to the outlines that "
+        "trajectories and body predict (outlines); or fit once (off). auto: what is most accurate for its cost, at present off.",
+        choices=("auto", "off", "tracks", "outlines"),
+    )
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
     shared_frames: float = knob(
         1.0,

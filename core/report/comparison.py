@@ -15,7 +15,7 @@ PUBLISHED, DEFAULT = "published", "default"  # the methods, by the names of thei
 METHODS = (PUBLISHED, DEFAULT)
 HIGHER, LOWER, NEITHER = "higher", "lower", ""  # which values of a measure are better
 EQUAL = 0.02  # relative difference below which neither method is better
-KINDS = ("trails", "surface", "cloud", "tracks", "body")  # of pictures
+KINDS = ("trails", "vectors", "surface", "cloud", "tracks", "body", "layers")  # of pictures
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -15,6 +15,8 @@ figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{dis
 grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.cells{gap:.4em;
 grid-template-columns:repeat(auto-fit,minmax(150px,1fr))}.graphs{
 grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}.wide{overflow-x:auto}
+.single{grid-template-columns:1fr}.broad{grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}
+figure img{width:100%}svg.strip{min-width:640px}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
 .note{background:var(--note);padding:.4em .8em;margin:.4em 0}.soft{color:var(--soft)}.good{color:var(--good)}.bad{color:var(--bad)}
 .verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;

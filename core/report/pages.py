@@ -28,13 +28,21 @@ from . import pictures
 from .document import document, figure, notes, table
 from .figures import Row, figure_rows, figures_csv, number, quoted
 from .graphs import SCRIPT, curve_graph
+from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
 from .overview import LEGEND, body_by_sigma, bone_sigma_mm, strip_frames, verdict, window_px
 from .silhouettes import OUTLINE, PERSON, Silhouettes
-from .trails import trail_pictures
+from .trails import trail_pictures, vector_pictures
 
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
-KINDS = {"Measured surface": ("surface", "cloud"), "Trajectories": ("tracks", "trails"), "Body over the footage": ("body",)}  # of pictures
+KINDS = {  # of pictures
+    "Measured surface": ("surface", "cloud"),
+    "Trajectories": ("tracks", "vectors", "trails"),
+    "Body over the footage": ("body",),
+    "Layers of the body": ("layers",),
+}
+BROAD = ("cloud", "vectors", "trails")  # of two panels
+AXES = "Axes of the reference camera: x to the right, y down, z away from it. In the rest pose: x to the person's left, z up."
 SIDES = {"L": "Left", "R": "Right"}
 LABELS = {
     "points_per_frame": "points a frame",
@@ -81,6 +89,11 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     shown = _pictures(report, monitor, pictured, skinned=skin_at is not None) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
+    if report.trajectories is not None:
+        tracks, camera = report.trajectories, report.footage.rig.cameras[report.footage.take.reference]
+        vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2)
+        shown |= {f"vectors_{name}.png": picture for name, picture in zip(("velocity", "acceleration"), vectors)}
+    shown |= _layers(report, skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
@@ -131,20 +144,33 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
         high = float(np.percentile(sigma, 95)) if len(sigma) else 1.0
         measured = f"{len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)"
         on_image = pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)
-        add(f"surface_{frame:04d}.png", f"Frame {frame}, view {view}: {measured}", on_image)
+        add(f"surface_{frame:04d}.png", f"Frame {frame}, view {view}: {measured}", pictures.with_scale(on_image, camera, cloud.xyz_m))
         from_sides = pictures.cloud_views(cloud, camera, record["settings"]["growing"]["spacing_px"])
         add(f"cloud_{frame:04d}.png", f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
-            add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
+            on_image = pictures.tracks_over_footage(images[ref], camera, trajectories, i)
+            add(f"tracks_{frame:04d}.png", caption, pictures.with_scale(on_image, camera, cloud.xyz_m))
         if body is not None and skinned:
             skin = body_skin(shape_with_ends(body.shape, settings), body.motion.values[i], settings)  # exact, as the silhouettes' figures
             for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
+                pictures.with_scale(picture, cam, body.motion.joints_m[i])
                 agreement = _agreement_caption(silhouettes, name, frame)
                 add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{agreement}", picture)
     return found
+
+
+def _layers(report: Report, skin_at: Callable[[np.ndarray], Skin] | None) -> dict[str, tuple[str, np.ndarray]]:
+    """The picture of the body's layers; none without a skin."""
+    if report.body is None or skin_at is None:
+        return {}
+    shape = report.body.shape
+    rest = skin_at(np.zeros(len(shape.skeleton.dofs)))
+    words = "The fitted body in its rest pose, from the front: skeleton; metaballs, each as the ellipsoid that it shows alone "
+    caption = f"{words}({kinds_shown(shape)}); polygons of the skin that blends them; the skin shaded"
+    return {"layers.png": (caption, layers_picture(shape, rest))}
 
 
 def _agreement_caption(silhouettes: Silhouettes, view: str, frame: int) -> str:
@@ -198,7 +224,23 @@ def _measurement_graphs(report: Report) -> list[str]:
     ]
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
+        for title, unit, vectors in (
+            ("Speed of the tracked points: median (red), 95 % (blue)", "m/s", trajectories.velocity_m_s),
+            ("Acceleration of the tracked points: median (red), 95 % (blue)", "m/s²", trajectories.acceleration_m_s2),
+        ):
+            graphs.append(curve_graph(title, unit, trajectories.frames, _typical(vectors)))
     return graphs
+
+
+def _typical(vectors: np.ndarray) -> dict[str, np.ndarray]:
+    """The median and the 95th percentile (T,) of the size of vectors (T, N, 3) in each frame; NaN in a frame without any."""
+    found = np.full((2, len(vectors)), np.nan)
+    for t, row in enumerate(vectors):
+        size = np.linalg.norm(row, axis=1)
+        size = size[np.isfinite(size)]
+        if len(size):
+            found[:, t] = np.percentile(size, [50, 95])
+    return {"median": found[0], "95 %": found[1]}
 
 
 def _limbs(body: BodyFit | None) -> str:
@@ -207,7 +249,7 @@ def _limbs(body: BodyFit | None) -> str:
         return ""
     frames, words = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
     lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
-    return f'<h2>Limbs</h2>{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
+    return f'<h2>Limbs</h2><div class="wide">{limb_strip(frames, words)}</div><p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
 
 
 def _limb_graphs(report: Report) -> dict[str, list[str]]:
@@ -244,10 +286,13 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         f"{record['fps']:g} frames/s, interlaced: {record['interlaced']}"
     )
     cells = "".join(figure(caption, picture) for caption, picture in strip)
+    found = {
+        kind: [figure(*files[name]) for name in files if name.startswith((f"{kind}_", f"{kind}."))] for kind in sum(KINDS.values(), ())
+    }
     shown = "".join(
-        f"<h2>{title}</h2><div class='row'>{''.join(found)}</div>"
+        f"<h2>{title}</h2>{''.join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])}"
         for title, kinds in KINDS.items()
-        if (found := [figure(*files[name]) for kind in kinds for name in files if name.startswith(f"{kind}_")])
+        if any(found[kind] for kind in kinds)
     )
     limbs = "".join(_folded(limb, _grid(graphs)) for limb, graphs in _limb_graphs(report).items() if any(graphs))
     settings = "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
@@ -259,8 +304,8 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         + (f'<div class="row cells">{cells}</div><p class="soft">{LEGEND}</p>' if cells else "")
         + notes(record["warnings"])
         + _limbs(report.body)
-        + f'{shown}<h2>Over time</h2><p class="soft">Point at a curve to read it, drag over a range to enlarge it, double-click to see '
-        "all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"
+        + f'{shown}<p class="soft">{AXES}</p><h2>Over time</h2><p class="soft">Point at a curve to read it, drag over '
+        "a range to enlarge it, double-click to see all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"
         f"{graphs}{limbs}<h2>All figures</h2>"
         + _folded("Figures (also in report.json and figures.csv)", _quotable(rows))
         + _folded("Stages", f"<table>{stages}</table>")
@@ -268,6 +313,12 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         + _folded("Settings", f"<pre>{html.escape(settings)}</pre>")
     )
     return document(f"Tricap: {report.record['take'].rsplit('/', 1)[-1]}", body, SCRIPT)
+
+
+def _picture_row(kind: str, figures: Sequence[str]) -> str:
+    """Figures beside each other; those that have two or four panels are wider."""
+    width = "single" if len(figures) == 1 else "broad" if kind in BROAD else ""
+    return f'<div class="row {width}">{"".join(figures)}</div>'
 
 
 def _grid(graphs: Sequence[str]) -> str:

@@ -10,8 +10,10 @@ from ..body.skeleton import joint_positions
 from ..body.skin.contour_skin import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
+from ..geometry.robust import finite_median
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
+from .drawing import add_axes, add_scale
 from .silhouettes import outlines_of
 
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
@@ -80,7 +82,11 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     radius = max(1, round(0.9 * spacing_px * float(centre[2]) / camera.focal_px * scale))
     front = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     side = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-    return np.hstack([_points_picture((p - centre) @ R.T, n @ R.T, scale, radius) for R in (front, side)])
+    pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius) for R in (front, side)]
+    for picture, names in zip(pair, (("x", "y"), ("z", "y"))):
+        add_scale(picture, scale)
+        add_axes(picture, names, left=names[0] == "z")
+    return np.hstack(pair)
 
 
 def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int) -> np.ndarray:
@@ -105,6 +111,16 @@ def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray,
 def colour(grey: np.ndarray) -> np.ndarray:
     """A grey image (h, w) as BGR uint8."""
     return cv2.cvtColor(np.clip(grey, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+
+
+def with_scale(picture: np.ndarray, camera: Camera, xyz_m: np.ndarray) -> np.ndarray:
+    """A picture over footage with the scale at the median depth of points (N, 3), and with the camera's axes."""
+    depth = camera.to_camera(xyz_m)[:, 2] if len(xyz_m) else np.zeros(0)
+    near = finite_median(np.where(depth > 0, depth, np.nan))
+    if np.isfinite(near):
+        add_scale(picture, camera.focal_px / near, "at the person")
+    add_axes(picture, ("x", "y"))
+    return picture
 
 
 def png(picture: np.ndarray) -> bytes:

@@ -1,7 +1,6 @@
 """Trajectories before and after the filters, from the front and from the side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all that were
 tracked, what was removed, by reason, and what was kept."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,27 +8,18 @@ import numpy as np
 
 from ..foundation import store
 from ..geometry.camera import Camera
+from ..tracking.reasons import COLOUR_WORDS, REASON_COLOURS
 from ..tracking.settings import TrackStatus
+from ..tracking.trajectories import Trajectories
+from .drawing import add_axes, add_scale
 
 SIDE_PX = 360
+MOST_ARROWS = 700  # in one picture; of more, every n-th point
+ARROW = 0.12  # length of the longest arrows, by half the picture; of the few beyond them at most …
+MOST_LONG = 2.0  # … this many times as long
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
 GROUND = (28, 28, 28)
 ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
-REASONS = {  # BGR by reason; the others are grey
-    TrackStatus.NOT_FOUND: (60, 160, 250),
-    TrackStatus.NOT_MATCHED: (60, 160, 250),
-    TrackStatus.NOT_VERIFIED: (40, 220, 240),
-    TrackStatus.RAYS_MISS: (40, 220, 240),
-    TrackStatus.TOO_FAST: (70, 70, 240),
-    TrackStatus.ACCELERATES: (70, 70, 240),
-    TrackStatus.NOT_UNIFORM: (230, 110, 200),
-    TrackStatus.NOT_RIGID: (230, 110, 200),
-    TrackStatus.UNSUPPORTED: (230, 110, 200),
-    TrackStatus.UNCERTAIN: (230, 160, 70),
-}
-COLOUR_WORDS = (
-    "red too fast or accelerating, violet unlike its neighbours, blue uncertain, yellow not verified, orange not found, grey others"
-)
 
 
 def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
@@ -51,7 +41,7 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     removed = seen & ~kept
     reason = np.where(removed, status, 0)
     colours = np.full((*status.shape, 3), (150, 150, 150), dtype=np.int64)
-    for value, colour in REASONS.items():
+    for value, colour in REASON_COLOURS.items():
         colours[reason == value] = colour
     grey, green = (np.broadcast_to(np.array(c), colours.shape) for c in (ALL_COLOUR, KEPT_COLOUR))
     some = f", one trajectory in {every}" if every > 1 else ""
@@ -61,6 +51,45 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
         (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", both_views(place, removed, colours, limits)),
         (f"The {int(kept.sum()):,} positions that were kept, {both}", both_views(place, kept, green, limits)),
     ]
+
+
+def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> list[tuple[str, np.ndarray]]:
+    """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the front and from the side
+    (D'Apuzzo et al. 1999, Fig. 9); none without any."""
+    found, place = [], camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
+    for name, unit, vectors in (
+        ("velocities", "m/s", trajectories.velocity_m_s[index]),
+        ("accelerations", "m/s²", trajectories.acceleration_m_s2[index]),
+    ):
+        own = vectors.astype(np.float64) @ camera.R_cam_world.T
+        rows = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(own).all(axis=1))
+        if not len(rows):
+            continue
+        every = max(1, -(-len(rows) // MOST_ARROWS))
+        rows = rows[::every]
+        size = np.linalg.norm(own[rows], axis=1)
+        longest = max(float(np.percentile(size, 95)), 1e-6)
+        limits = limits_of(place[rows])
+        arrows = own[rows] * (ARROW * limits[1] / longest * np.minimum(1.0, MOST_LONG * longest / np.maximum(size, 1e-12)))[:, None]
+        pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
+        some = f", one point in {every}" if every > 1 else ""
+        words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
+        found.append((f"{words}; blue 0, red {longest:.2g} {unit} or more, an arrow that long", np.hstack(pair)))
+    return found
+
+
+def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tuple[np.ndarray, float], axes: str) -> np.ndarray:
+    """Arrows (N, 3) at places (N, 3), coloured by their share (N,) of the longest."""
+    picture, (middle, half) = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8), limits
+    rows, signs = (0, 1) if axes == "xy" else (2, 1), np.array([1.0 if axes == "xy" else -1.0, 1.0])
+    start, end = (SIDE_PX / 2 * (1 + (p[:, rows] - middle[list(rows)]) * signs / half) for p in (place, place + arrows))
+    tints = cv2.applyColorMap(np.clip(255 * share, 0, 255).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
+    ends = np.clip(np.rint(8 * np.stack([start, end], axis=1)), -(2**20), 2**20).astype(int)
+    for (a, b), tint in zip(ends.tolist(), tints.tolist()):
+        cv2.arrowedLine(picture, a, b, tint, 1, cv2.LINE_AA, 3, 0.3)
+    add_scale(picture, SIDE_PX / 2 / half)
+    add_axes(picture, (axes[0], axes[1]), left=axes == "zy")
+    return picture
 
 
 def limits_of(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -73,13 +102,13 @@ def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits
     """Both views of places (T, N, 3) in the camera's axes, of those that are `shown` (T, N), with a scale."""
     middle, half = limits
     pair = []
-    for axes, signs, names in (((0, 1), (1, 1), "x y"), ((2, 1), (-1, 1), "z y")):
+    for axes, signs, names in (((0, 1), (1, 1), ("x", "y")), ((2, 1), (-1, 1), ("z", "y"))):
         xy = SIDE_PX / 2 * (1 + (place[..., axes] - middle[list(axes)]) * signs / half)
-        pair.append(_trails(xy, shown, colours, half, names.split()))
+        pair.append(_trails(xy, shown, colours, half, names))
     return np.hstack(pair)
 
 
-def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: float, names: Sequence[str]) -> np.ndarray:
+def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: float, names: tuple[str, str]) -> np.ndarray:
     """The steps to the shown places as lines, with a scale and the axes."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8)
     pixel = np.clip(np.nan_to_num(xy), -9 * SIDE_PX, 9 * SIDE_PX)
@@ -87,24 +116,6 @@ def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: floa
     lines, colour = np.rint(8 * np.stack([pixel[:-1][step], pixel[1:][step]], axis=1)).astype(np.int32), colours[1:][step]
     for one in np.unique(colour, axis=0):
         cv2.polylines(picture, list(lines[(colour == one).all(axis=1)]), False, one.tolist(), 1, cv2.LINE_AA, 3)
-    bar_m = 10.0 ** np.floor(np.log10(half_m))
-    bar = round(SIDE_PX / 2 * bar_m / half_m)
-    cv2.line(picture, (12, SIDE_PX - 14), (12 + bar, SIDE_PX - 14), (255, 255, 255), 2)
-    label = f"{bar_m:g} m" if bar_m >= 1 else f"{100 * bar_m:g} cm"
-    cv2.putText(picture, label, (12, SIDE_PX - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
-    corner = np.array([SIDE_PX - 44, SIDE_PX - 34])
-    for name, end in zip(names, ((26, 0), (0, 26))):
-        sign = -1 if name == "z" else 1
-        tip = corner + np.array(end) * sign
-        cv2.arrowedLine(picture, tuple(corner.tolist()), tuple(tip.tolist()), (255, 255, 255), 1, cv2.LINE_AA, tipLength=0.25)
-        cv2.putText(
-            picture,
-            name,
-            tuple((tip + (-10 if sign < 0 else 3, 4)).tolist()),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.4,
-            (255, 255, 255),
-            1,
-            cv2.LINE_AA,
-        )
+    add_scale(picture, SIDE_PX / 2 / half_m)
+    add_axes(picture, names, left=names[0] == "z")
     return picture

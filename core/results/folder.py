@@ -20,13 +20,22 @@ from .run_json import FORMAT, VERSION
 
 RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
-    "joints.csv", "motion.csv", "body.toml", "skin", "report", "film.mp4",
+    "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4",
     "body.blend",
 )  # fmt: skip
 
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
 PARENTS = ("cache", FIELDS)  # whose folders are written to
-WRITTEN = (*PARENTS, "contours", "points2d.csv", "points3d.csv", "run.json", NAME, *RESULTS)  # every name in OUT that a command writes to
+WRITTEN = (
+    *PARENTS,
+    "contours",
+    "planar",
+    "points2d.csv",
+    "points3d.csv",
+    "run.json",
+    NAME,
+    *RESULTS,
+)  # every name in OUT that a command writes to
 
 
 def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
@@ -90,7 +99,7 @@ class Results:
             InputError: another run is using it.
         """
         with locked(self.folder):
-            folders = [self.path(name) for name in ("clouds", "tracked", "skin", "report", "contours")]
+            folders = [self.path(name) for name in ("clouds", "tracked", "skin", "report", "contours", "outlines")]
             for folder in (self.folder, *folders, *self.path("cache").glob("*/")):
                 for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
                     self.remove(str(path.relative_to(self.folder)))

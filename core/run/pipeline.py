@@ -4,6 +4,7 @@ Every stage asks the stages before it for their results. What has a checkpoint i
 """
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
 from .around_clicks import FITTED_WITH, fitted_with
+from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
@@ -54,7 +56,7 @@ from .stages import STAGES
 from .take_run import Run, open_run
 from .workers import measure_at_once
 
-BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin")  # of the fit, besides the report
+BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin", "outlines")  # of the fit, besides the report
 
 
 def measure(run: Run, monitor: Monitor) -> None:
@@ -258,12 +260,19 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
     given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
     given = with_start(given, fitting, monitor)
-    run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
+    body, tracked_again = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"])), dict[str, Any]()
+    loop = loop_of(fitting, body.shape.skeleton) if run.measured else OFF
+    if run.measured and (fitting.track_again or loop != OFF):
+        tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage))
+    if loop != OFF:
+        clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
+        contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
+        given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
+        body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, f"{run.keys['fit']} again"))
+    run.body = body
     _write_body(run, body, monitor)
-    guided = fitting.track_again and run.measured
-    tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage)) if guided else {}
     run.results.remove("cache/fit")
-    outlines = outline_polygons(run.footage, run.results)
+    outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again
 

@@ -53,6 +53,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "method": "alternating",
             "residual": "paper",
             "use_trajectories": False,
+            "closed_loop": "off",
             "use_background": False,
             "complete_surface": False,
             "place_joints": "off",

@@ -33,9 +33,12 @@ from ..geometry.rotation import axis_rotation
 from ..images.interlace import BOTH, INTERLACE, field_layout, frame_time_s
 from .figure import Part, arm_parts, joined, torso_parts, wall
 from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, solid_noise, visible_vertices
+from .person import person
+from .subject import Subject
 from .truth import motion_capture_name, read_truth
 
 STAGE = "sample recording"
+ARM, PERSON = "arm", "person"
 SHOULDER_M = np.array([-0.185, -0.010, 1.450])
 LENGTHS_M = np.array([0.272, 0.248])  # upper arm, forearm
 VISIBLE_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[0.044, 0.041], [0.039, 0.036], [0.032, 0.029]]])  # x, z
@@ -52,13 +55,14 @@ SENSORS = dict(L=Sensor(gain=1.06, offset=-4.0), C=Sensor(), R=Sensor(gain=0.94,
 class ArmTakeSettings:
     """The synthetic recording."""
 
+    subject: str = knob(ARM, "Who is filmed: an arm of metaballs, or a whole person who is not made of metaballs.", choices=(ARM, PERSON))
     frames: int = knob(16, "Frames of the recording.", low=2, high=1000)
     fps: float = knob(25.0, "Frame rate.", unit="1/s", low=1.0, high=1000.0)
     width_px: int = knob(768, "Width of the pictures; the height is three quarters of it.", unit="px", low=96, high=4096)
     interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=(*INTERLACE, BOTH))
     noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
     texture: float = knob(1.0, "Multiplies the contrast of all textures; 0.2 is as weak as bare skin.", low=0.0, high=2.0)
-    swing_s: float = knob(SWING_S, "Duration of a swing of the arm, there and back.", unit="s", low=0.2, high=1000.0)
+    swing_s: float = knob(SWING_S, "Duration of a swing of the arm, or of a double step, there and back.", unit="s", low=0.2, high=1000.0)
     click_error_px: float = knob(4.0, "Largest error of the joint clicks, in x and in y.", unit="px", low=0.0, high=100.0)
     late_frames: float = knob(0.0, "Frame offset of view R relative to the others.", unit="frames", low=-100.0, high=100.0)
     seed: int = knob(1, "Seed of the random textures, noise and clicks.", low=0, high=2**31 - 1)
@@ -70,15 +74,9 @@ class _Studio:
 
     settings: ArmTakeSettings
     rig: Rig
-    shape: BodyShape
-    at_rest: tuple[Part, ...]
+    subject: Subject
     noise: SolidNoise
     backdrops: tuple[Layer, ...]  # the wall in each camera
-
-    def body(self, time_s: float) -> tuple[Part, ...]:
-        """The person at one moment."""
-        motion = arm_motion(time_s, self.settings.swing_s)
-        return (*arm_parts(self.shape, motion, self.at_rest), *torso_parts(motion[:3]))
 
 
 def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor: Monitor | None = None) -> None:
@@ -117,14 +115,30 @@ def _made_here(folder: Path) -> bool:
 
 
 def _studio(settings: ArmTakeSettings) -> _Studio:
-    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed).scaled(settings.texture)
-    return _Studio(
-        settings=settings,
-        rig=rig,
+    subject = person(settings.swing_s) if settings.subject == PERSON else arm(settings.swing_s)
+    rig, noise = rig_for(subject, settings.width_px), solid_noise(settings.seed).scaled(settings.texture)
+    backdrops = tuple(paint(camera, [subject.backdrop], noise) for camera in rig.cameras)
+    return _Studio(settings=settings, rig=rig, subject=subject, noise=noise, backdrops=backdrops)
+
+
+def arm(swing_s: float) -> Subject:
+    """The right arm of a person whose torso sways with it."""
+    shape = arm_shape()
+    at_rest = arm_parts(shape, np.zeros(len(shape.skeleton.dof_names)))
+
+    def parts(time_s: float) -> tuple[Part, ...]:
+        motion = arm_motion(time_s, swing_s)
+        return (*arm_parts(shape, motion, at_rest), *torso_parts(motion[:3]))
+
+    return Subject(
         shape=shape,
-        noise=noise,
-        at_rest=arm_parts(shape, np.zeros(len(shape.skeleton.dof_names))),
-        backdrops=tuple(paint(camera, [wall(WALL_Y_M)], noise) for camera in rig.cameras),
+        joints=JOINTS,
+        motion=lambda time_s: arm_motion(time_s, swing_s),
+        parts=parts,
+        backdrop=wall(WALL_Y_M),
+        target_m=TARGET_M,
+        scale=1.0,
+        is_metaballs=True,
     )
 
 
@@ -161,7 +175,17 @@ def arm_motion(time_s: np.ndarray | float, swing_s: float = SWING_S) -> np.ndarr
 
 
 def arm_rig(width_px: int) -> Rig:
-    """Three cameras in a row, 1.9 m before the arm and 0.35 m apart, turned inwards, each with a distortion of its own."""
+    """Three cameras in a row, 1.9 m before the arm and 0.35 m apart."""
+    return _rig(width_px, TARGET_M, 1.0)
+
+
+def rig_for(subject: Subject, width_px: int) -> Rig:
+    """The cameras for a subject."""
+    return _rig(width_px, subject.target_m, subject.scale)
+
+
+def _rig(width_px: int, target_m: np.ndarray, size: float) -> Rig:
+    """Three cameras in a row, turned inwards to a target (3,), each with a distortion of its own; `size` multiplies their distances."""
     scale = width_px / 768
     cameras = []
     for name, x, y, z, roll, focal, cx, cy, k1, p1, p2 in (
@@ -169,8 +193,8 @@ def arm_rig(width_px: int) -> Rig:
         ("C", 0.0, 0.0, 0.025, -0.006, 1498.7, 381.7, 290.3, -0.118, 4e-4, -4e-4),
         ("R", 0.345, 0.028, 0.004, 0.009, 1507.9, 384.6, 282.2, -0.107, 6e-4, -2e-4),
     ):
-        centre = TARGET_M + np.array([x, y - 1.9, z])
-        ahead = (TARGET_M - centre) / np.linalg.norm(TARGET_M - centre)
+        centre = target_m + size * np.array([x, y - 1.9, z])
+        ahead = (target_m - centre) / np.linalg.norm(target_m - centre)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         R = axis_rotation("z", roll) @ np.stack([right, np.cross(ahead, right), ahead])
@@ -206,8 +230,8 @@ def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> 
     """Write one image of all views; return the vertices (V,) visible in all of them, a row for each instant of the selected fields."""
     settings, kept = studio.settings, field_layout(studio.settings.interlaced).first
     moments = [frame_time_s(frame, settings.fps)] + ([frame_time_s(frame + 0.5, settings.fps)] if kept.step == 2 else [])
-    bodies = [studio.body(time) for time in moments]
-    late = [studio.body(time + settings.late_frames / settings.fps) for time in moments] if settings.late_frames else bodies
+    bodies = [studio.subject.parts(time) for time in moments]
+    late = [studio.subject.parts(time + settings.late_frames / settings.fps) for time in moments] if settings.late_frames else bodies
     scenes = [joined(body) for body in bodies[: field_layout(settings.interlaced).per_image]]
     seen = np.ones((len(scenes), len(scenes[0].vertices_m)), dtype=bool)
     for i, camera in enumerate(studio.rig.cameras):
@@ -229,9 +253,9 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 
 
 def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
-    shape, per = studio.shape, field_layout(studio.settings.interlaced).per_image
+    shape, per = studio.subject.shape, field_layout(studio.settings.interlaced).per_image
     time = frame_time_s(np.arange(per * studio.settings.frames), per * studio.settings.fps)
-    motion, bodies = arm_motion(time, studio.settings.swing_s), [studio.body(moment) for moment in time]
+    motion, bodies = studio.subject.motion(time), [studio.subject.parts(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])
     arrays = dict(
@@ -239,26 +263,26 @@ def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
         triangles=joined(bodies[0]).triangles.astype(np.int32),
         textured=textured,
         visible=np.packbits(visible, axis=1),
-        joints_m=np.stack([joints[name] for name in JOINTS], axis=1),
-        joint_names=np.array([motion_capture_name(name) for name in JOINTS]),
+        joints_m=np.stack([joints[name] for name in studio.subject.joints], axis=1),
+        joint_names=np.array([motion_capture_name(name) for name in studio.subject.joints]),
         time_s=time,
         motion_values=motion,
         dof_names=np.array(shape.skeleton.dof_names),
         bone_names=np.array([bone.name for bone in shape.skeleton.bones]),
         lengths_m=shape.lengths_m,
-        radii_m=shape.metaballs.radii_m,
-        ball_bone=shape.metaballs.bone_index,
         settings=np.array(json.dumps(to_table(studio.settings))),
     )
+    if studio.subject.is_metaballs:
+        arrays |= dict(radii_m=shape.metaballs.radii_m, ball_bone=shape.metaballs.bone_index)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 
 def _take_toml(studio: _Studio) -> str:
-    settings, rig, shape = studio.settings, studio.rig, studio.shape
+    settings, rig, subject = studio.settings, studio.rig, studio.subject
     rng = np.random.default_rng([settings.seed, 77])
-    joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0, settings.swing_s))
+    joints = joint_positions(subject.shape.skeleton, subject.shape.lengths_m, subject.motion(0.0))
     lines = [
         'format = "tricap-take"',
         "version = 1",
@@ -269,8 +293,8 @@ def _take_toml(studio: _Studio) -> str:
     ]
     for camera in rig.cameras:
         lines += ["[[views]]", f'name = "{camera.name}"', f'images = "{camera.name}/*.png"', ""]
-    lines += ["[body]", f'model = "{shape.model}"', "", "[seeds]", "frame = 0", "[seeds.joints]"]
-    for name in JOINTS:
+    lines += ["[body]", f'model = "{subject.shape.model}"', "", "[seeds]", "frame = 0", "[seeds.joints]"]
+    for name in subject.joints:
         clicks = [camera.project(joints[name]) + rng.uniform(-1, 1, 2) * settings.click_error_px for camera in rig.cameras]
         lines.append(f'"{name}" = {{ ' + ", ".join(f"{c.name} = [{x:.1f}, {y:.1f}]" for c, (x, y) in zip(rig.cameras, clicks)) + " }")
     return "\n".join(lines) + "\n"

@@ -137,6 +137,49 @@ def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: t
         store.write_text(path, "\n".join(text) + "\n")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class KeyPointTable:
+    """The tables of `write_key_points`: N points over T frames and K views; NaN where a point is not visible."""
+
+    frames: np.ndarray  # (T,) ascending
+    names: tuple[str, ...]  # (N,)
+    views: tuple[str, ...]  # (K,)
+    xyz_m: np.ndarray  # (T, N, 3)
+    sigma_m: np.ndarray  # (T, N)
+    xy_px: np.ndarray  # (T, N, K, 2)
+
+
+def read_key_points(space: Path, images: Path) -> KeyPointTable:
+    """Read the tables of `write_key_points`.
+
+    Raises:
+        InputError: one cannot be read, or is another kind of table.
+    """
+    try:
+        rows, pixels = (list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES)))) for path in (space, images))
+        places = {(_frame(r), r["point"]): [float(r[c] or "nan") for c in ("x", "y", "z", "sigma")] for r in rows}
+        seen = {(_frame(r), r["point"], r["view"]): [float(r[c]) for c in "xy"] for r in pixels}
+    except OSError as error:
+        raise InputError(f"Cannot read the points {error.filename}: {error.strerror or error}.") from error
+    except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{space} and {images.name} are not tables of followed points ({error}); follow the points again.") from error
+    if not places:
+        raise InputError(f"{space} has no points; follow the points again.")
+    frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))
+    views = tuple(dict.fromkeys(view for *_, view in seen))
+    check_sparse(len(places), len(frames), len(names), space)
+    check_sparse(max(1, len(seen)), len(frames), max(1, len(names) * len(views)), images)
+    xyzs = np.array([[places.get((frame, name), [np.nan] * 4) for name in names] for frame in frames])
+    xyzs = np.where(np.isfinite(xyzs[..., :3]).all(axis=2, keepdims=True), xyzs, np.nan)
+    xy = [[[seen.get((frame, name, view), [np.nan] * 2) for view in views] for name in names] for frame in frames]
+    at = np.array(xy).reshape(len(frames), len(names), len(views), 2)
+    return KeyPointTable(frames=np.array(frames), names=names, views=views, xyz_m=xyzs[..., :3], sigma_m=xyzs[..., 3], xy_px=at)
+
+
+def _frame(row: dict[str, str]) -> int:
+    return int(np.int32(int(row["frame"])))
+
+
 def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"\n') else name
 

@@ -121,6 +121,7 @@ def test_a_scene_of_an_earlier_version_opens_and_is_built_again(
     assert not scene.tricap.show_metaballs and seen(empty) == set() and "show_metaballs" not in drawn.properties
     build_scene(small_run.out)
     bodies.rig(drawn, empty.context, False)
+    assert "body_layer" in drawn.properties
     assert "show_metaballs" in drawn.properties and [o.name for o in empty.data.objects if o.type == "META"][0] == "Flesh"
     assert not any(o.type == "META" for o in empty.data.collections["Body"].objects)
 

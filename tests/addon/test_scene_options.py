@@ -272,6 +272,38 @@ def test_colours_arrows_and_nothing_piles_up(empty: ModuleType, small_run: Small
     assert census() == first
 
 
+def test_what_the_filters_removed_is_shown_by_reason(empty: ModuleType, small_run: SmallRun) -> None:
+    """Only on request; a removed place is joined to the one before it, in the colour of its reason, and accelerations are arrows."""
+    from tricap.addon.scene.build import SceneOptions, write_scene
+    from tricap.addon.scene.contents import read_contents
+    from tricap.core.foundation import store
+    from tricap.core.foundation.errors import InputError
+    from tricap.core.foundation.progress import Monitor
+    from tricap.core.tracking.settings import TrackStatus
+
+    xyz = np.zeros((3, 2, 3)) + np.arange(3)[:, None, None] * 0.1
+    status = np.full((3, 2), TrackStatus.MEASURED, dtype=np.int8)
+    status[2, 0], status[1:, 1] = TrackStatus.TOO_FAST, TrackStatus.UNCERTAIN
+    path = small_run.out / "trajectories_raw.npz"
+    store.save(path, dict(frames=np.arange(3), xyz_m=xyz.astype(np.float32), status=status), {})
+    assert read_contents(small_run.out, Monitor()).raw is None
+    contents = read_contents(small_run.out, Monitor(), removed=True)
+    write_scene(contents, options=SceneOptions(arrows=True))
+    mesh = empty.data.objects["Removed trajectories"].data
+    assert len(mesh.edges) == 3 and len(mesh.vertices) == 5, "one step of the first point and both of the second"
+    reasons = {value.value for value in mesh.attributes["reason"].data}
+    assert reasons == {TrackStatus.MEASURED, TrackStatus.TOO_FAST, TrackStatus.UNCERTAIN}
+    colours = np.array([value.vector for value in mesh.attributes["colour"].data])
+    of = np.array([value.value for value in mesh.attributes["reason"].data])
+    assert (colours[of == TrackStatus.TOO_FAST].argmax(axis=1) == 0).all() and (
+        colours[of == TrackStatus.UNCERTAIN].argmax(axis=1) == 2
+    ).all()
+    assert "Accelerations" in empty.data.objects
+    store.save(path, dict(frames=np.arange(3), xyz_m=xyz.astype(np.float32), status=np.full((3, 2), 99, dtype=np.int8)), {})
+    with pytest.raises(InputError, match="invalid states"):
+        read_contents(small_run.out, Monitor(), removed=True)
+
+
 def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> None:
     from tricap.addon.scene import metaballs, skin
 

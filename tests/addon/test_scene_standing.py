@@ -128,7 +128,7 @@ def test_the_scene_is_tidy_and_a_render_shows_the_body(empty: ModuleType, out: P
     assert parts == {
         "Cameras": set(),
         "Measured": set(),
-        "Body": {"Body", "Skin"},
+        "Body": {"Body", "Ellipsoids", "Skin"},
         "Lights": {"Key light", "Fill light"},
         "Floor": {"Floor"},
     }

@@ -42,13 +42,14 @@ def empty_clouds(footage: Footage) -> list[PointCloud]:
     ]
 
 
-def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[int, np.ndarray]]:
-    """The outline (V, 2) px of the person from `tricap contour`, by view and frame; views without one are omitted.
+def outline_polygons(footage: Footage, results: Results, folder: str = "contours") -> dict[str, Mapping[int, np.ndarray]]:
+    """The outline (V, 2) px of the person from `tricap contour`, or others in a folder of OUT, by view and frame; views without one are
+    omitted.
 
     Raises:
         InputError: a table of contours is damaged.
     """
-    tables = {view.name: ContourTable(results.path("contours", f"{view.name}.csv")) for view in footage.take.views}
+    tables = {view.name: ContourTable(results.path(folder, f"{view.name}.csv")) for view in footage.take.views}
     polygons = {name: Polygons(table, footage.frames, LEAST_CORNERS) for name, table in tables.items()}
     return {name: found for name, found in polygons.items() if found}
 

@@ -139,13 +139,13 @@ class EdgesOfTable:
         return (found.xy_px[rows], found.normal[rows], found.sigma_px[rows]) if len(rows) else None
 
 
-def read_contours(results: Results, views: Sequence[str]) -> list[EdgesOfTable]:
-    """The outlines that `tricap contour` wrote, of the views that have one.
+def read_contours(results: Results, views: Sequence[str], folder: str = "contours") -> list[EdgesOfTable]:
+    """The outlines that `tricap contour` wrote, or others in a folder of OUT, of the views that have one.
 
     Raises:
         InputError: a table is damaged.
     """
-    tables = [(view, ContourTable(results.path("contours", f"{view}.csv"))) for view in views]
+    tables = [(view, ContourTable(results.path(folder, f"{view}.csv"))) for view in views]
     return [EdgesOfTable(view=view, table=table) for view, table in tables if table]
 
 

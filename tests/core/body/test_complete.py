@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tricap.core.body.complete import RINGS, TABLES, arrangement, complete_shape
+from tricap.core.body.anatomy import BONE, FAT, FLESH, MUSCLE, RINGS, TABLES, arrangement, ball_names, kind_of
+from tricap.core.body.complete import complete_shape
 from tricap.core.body.model_file import read_model
 from tricap.core.body.parts import bone_profiles, chain_neighbours
 from tricap.core.body.shape import BodyShape, default_shape, read_body, write_body
@@ -28,6 +29,24 @@ def test_every_fleshy_bone_of_the_whole_body_has_its_groups(whole: tuple[BodySha
     assert all(count[name] == len(arrangement(name)) and arrangement(name) is not RINGS for name in count)
     assert arrangement("tail") is RINGS and {ball.name for ball in TABLES["upper_arm"]} > {"deltoid", "biceps, long head"}
     assert all(len({ball.name for ball in table}) == len(table) for table in TABLES.values())
+
+
+def test_every_ball_has_a_name_and_a_kind(whole: tuple[BodyShape, BodyShape], tmp_path: Path) -> None:
+    simple, complete = whole
+    names = [bone.name for bone in simple.skeleton.bones]
+    found = ball_names(names, complete.metaballs.bone_index)
+    arm = [f.name for f, b in zip(found, complete.metaballs.bone_index) if names[b] == "upper_arm.L"]
+    assert arm == [ball.name for ball in TABLES["upper_arm"]]
+    assert {f.kind for f in found} == {BONE, MUSCLE, FAT} and [f.kind for f in found].count(MUSCLE) > len(found) / 2
+    assert (kind_of("core 2"), kind_of("deltoid, front"), kind_of("heel"), kind_of("scapula, left")) == (BONE, MUSCLE, FAT, BONE)
+    assert {(f.name, f.kind) for f in ball_names(names, simple.metaballs.bone_index)} == {
+        (f"{third} third", FLESH) for third in ("near", "middle", "far")
+    }
+    assert [f.name for f in ball_names(["tail"], np.array([0, 0]))] == ["ball 1", "ball 2"], "a number of balls that no table has"
+    write_body(tmp_path / "body.toml", complete)
+    text = (tmp_path / "body.toml").read_text()
+    assert text.count('name = "biceps, long head"') == 2 and text.count('kind = "fat"') == [f.kind for f in found].count(FAT)
+    assert np.array_equal(read_body(tmp_path / "body.toml").metaballs.radii_m, complete.metaballs.radii_m)
 
 
 def test_its_surface_is_the_simplified_bodys(whole: tuple[BodyShape, BodyShape]) -> None:

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.cli.contour import ContourCheckpoints, Start, _before_background, track_contour
 from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.interlace import RowGrid
 from tricap.core.motion.formats.ply import write_mesh
 from tricap.core.results.folder import Results
+from tricap.core.run.outlines import ContourCheckpoints, Start, _before_background, track_contour
 from tricap.core.tracking.contour import Contour, ContourSettings
 
 HALF_M = (0.2, 0.15)

@@ -26,8 +26,10 @@ from tricap.core.report.overview import CELL_PX, body_by_sigma, bone_sigma_mm, s
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
-from tricap.core.report.trails import GROUND, KEPT_COLOUR, REASONS, SIDE_PX, trail_pictures
+from tricap.core.report.trails import GROUND, KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.tracking.reasons import REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
+from tricap.core.tracking.trajectories import with_kinematics
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed (Debian: chromium)")
@@ -139,10 +141,32 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
         size = np.linalg.norm(over, axis=2)
         return bool((over @ wanted > 0.99 * size * np.linalg.norm(wanted))[size > 40].any())
 
-    assert has(red, REASONS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
-    assert before.any() and not has(before, REASONS[TrackStatus.TOO_FAST])
+    assert has(red, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert before.any() and not has(before, REASON_COLOURS[TrackStatus.TOO_FAST])
     assert trail_pictures(tmp_path / "none.npz", camera) == []
     assert trail_pictures(raw(tmp_path / "empty.npz", np.zeros((3, 2), dtype=np.int8)), camera) == []
+
+
+def test_vectors_point_where_the_points_go(scenes: Any) -> None:
+    """Three points that go to the right faster and faster: arrows to the right in front, none from the side, with the sizes in words."""
+    camera = scenes.three_cameras()["C"]
+    t = np.arange(5.0)[:, None, None]
+    right = camera.R_cam_world[0]
+    xyz = (
+        2.0 * camera.R_cam_world[2]
+        + camera.centre_m
+        + np.linspace(-0.1, 0.1, 3)[:, None] * camera.R_cam_world[1]
+        + 0.5 * t**2 * 0.01 * right
+    )
+    tracks = with_kinematics(np.arange(5), np.arange(5) / 10, xyz, np.full((5, 3), 1e-3), np.ones((5, 3), dtype=np.int8), 0)
+    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2)
+    assert "velocities of 3 tracked points" in speed and "red 0.2 m/s" in speed and "red 1 m/s²" in bend
+    front, side = np.split(front_and_side, 2, axis=1)
+    red = [(p[..., 2].astype(int) - p[..., 0] > 60) & (p[..., 1] < 120) for p in (front, side)]
+    columns = [len(np.unique(np.nonzero(r)[1])) for r in red]
+    assert columns[0] > 15 and columns[0] > 2 * columns[1]
+    empty = with_kinematics(np.arange(1), np.arange(1) / 10, xyz[:1], np.full((1, 3), 1e-3), np.ones((1, 3), dtype=np.int8), 0)
+    assert vector_pictures(empty, camera, 0) == [], "a single frame has no velocities"
 
 
 def page(tmp_path: Path) -> Path:
@@ -173,15 +197,17 @@ def test_names_are_text(tmp_path: Path) -> None:
 
 
 @needs_browser
-@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark")])
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark"), (794, 4, "paper")])
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
     watch = "window.failed = []; addEventListener('error', e => failed.push(e.message))"
     allowed = " ".join(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'" for code in (watch, PROBE))
     text = text.replace("script-src ", f"script-src {allowed} ")  # besides the page's own script
-    if scheme == "dark":
-        text = text.replace("(prefers-color-scheme:dark)", "all")
+    if scheme != "light":
+        text = text.replace(
+            {"dark": "(prefers-color-scheme:dark)", "paper": "@media print"}[scheme], {"dark": "all", "paper": "@media all"}[scheme]
+        )
     graph = curve_graph("first", "°", np.arange(11), {"a": 2.0 * np.arange(11)}, np.full(11, 1.0), limits=(-5.0, 15.0), marks=[4])
     text = text.replace("<h1>", f"<script>{watch}</script>{graph}<h1>", 1).replace("</body>", f"<script>{PROBE}</script></body>")
     (tmp_path / "probe.html").write_text(text)
@@ -192,7 +218,7 @@ def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, sche
     assert found, dom[-2000:]
     seen = json.loads(found[1])
     assert seen["errors"] == [] and seen["width"] <= seen["inner"] and seen["columns"] == columns
-    assert seen["paper"] == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(27, 29, 32)")
+    assert seen["paper"] == ("rgb(27, 29, 32)" if scheme == "dark" else "rgb(255, 255, 255)")
     assert seen["read"] == "frame 10: 20 °" and seen["zoomed"] == ["frame 5", "10"] and seen["whole"] == "frame 0" and seen["open"] >= 6
 
 

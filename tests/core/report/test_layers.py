@@ -1,0 +1,63 @@
+"""The picture of the body's layers, and what every picture has: a scale of a round length, and axes."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.body.complete import complete_shape
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.report.drawing import add_axes, add_scale, length_words
+from tricap.core.report.layers import GROUND, KIND_COLOURS, PANEL_PX, kinds_shown, layers_picture
+
+
+@pytest.fixture(scope="module")
+def panels() -> list[np.ndarray]:
+    shape = complete_shape(default_shape(read_model("arm.R")))
+    assert kinds_shown(shape) == "white: bone, red: muscle" and "flesh" in kinds_shown(default_shape(read_model("arm.R")))
+    picture = layers_picture(shape, body_skin(shape, np.zeros(len(shape.skeleton.dofs))))
+    assert picture.shape == (PANEL_PX[1], 4 * PANEL_PX[0], 3)
+    return np.split(picture, 4, axis=1)
+
+
+def covered(panel: np.ndarray) -> np.ndarray:
+    """Where a panel shows the body: not its title, scale and axes."""
+    there = (panel != GROUND).any(axis=2)
+    there[:30], there[-60:] = False, False
+    return there
+
+
+def test_each_layer_is_within_the_next(panels: list[np.ndarray]) -> None:
+    """The skeleton lies in the balls and the skin, and the polygons are the shaded skin's; all in one place."""
+    skeleton, balls, polygons, skin = (covered(p) for p in panels)
+    assert 500 < skeleton.sum() < balls.sum() < skin.sum()
+    about = cv2.dilate(skin.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # lines lie on the outline, and are blurred
+    assert (balls & skin).sum() > 0.95 * balls.sum() and (polygons & ~about).sum() < 0.01 * polygons.sum()
+    red = np.array(KIND_COLOURS["muscle"])
+    muscle = np.abs(panels[1][covered(panels[1])].astype(float) / red - (panels[1][covered(panels[1])][:, 2:] / red[2])).max(axis=1) < 0.1
+    assert 0.02 < muscle.mean() < 0.6, "muscles in their colour, between the bones in theirs"
+
+
+@pytest.mark.parametrize(
+    ("px_per_m", "bar_px", "words"), [(100.0, 50, "50 cm"), (1000.0, 50, "5 cm"), (30.0, 60, "2 m"), (12_000.0, 60, "5 mm")]
+)
+def test_the_scale_has_a_round_length(px_per_m: float, bar_px: int, words: str) -> None:
+    picture = np.zeros((120, 200, 3), np.uint8)
+    add_scale(picture, px_per_m)
+    white = np.flatnonzero((picture[106] == 255).all(axis=1))
+    assert abs(np.ptp(white) - bar_px) <= 3
+    assert words == length_words(bar_px / px_per_m)
+
+
+def test_nothing_without_a_scale_and_axes_point_where_they_should() -> None:
+    picture = np.zeros((120, 200, 3), np.uint8)
+    add_scale(picture, float("nan"))
+    add_scale(picture, 0.0)
+    assert not picture.any()
+    for left, up in ((False, False), (True, False), (False, True)):
+        picture[:] = 0
+        add_axes(picture, ("x", "y"), left=left, up=up)
+        y, x = np.nonzero(picture.any(axis=2))
+        corner = np.array([200 - 48, 120 - (18 if up else 44)])
+        assert (x.min() < corner[0] - 20) == left and (y.min() < corner[1] - 20) == up
