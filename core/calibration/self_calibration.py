@@ -99,7 +99,10 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     moving = moving_points(observations.frames, raw)
     late = first_delays(moving, observations.size_px, observations.labelled)
     done = _at_delays(observations, raw, late, monitor, focal_px) if late.any() else None
-    return done or _at_delays(observations, raw, np.zeros(len(late)), monitor, focal_px)
+    if done is None:
+        done = _at_delays(observations, raw, np.zeros(len(late)), monitor, focal_px)
+    assert done is not None
+    return done
 
 
 def _at_delays(
