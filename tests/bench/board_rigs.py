@@ -1,4 +1,4 @@
-"""Boards held before random rigs: how many are calibrated from nothing, how near the Cramér–Rao bound, and how well they predict their error.
+"""Boards held before random rigs: how many are calibrated from nothing, how near the bound, and how well they predict their error.
 
     .venv/py3.13/bin/python tests/bench/board_rigs.py [--rigs 200] [--first SEED] [--seconds S]
 

@@ -44,7 +44,10 @@ def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequenc
         counts = {name: s.count for name, s in zip(names, sequences)}
         if len(set(counts.values())) > 1:
             lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
-            raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
+            raise InputError(
+                f"The views in {folder} have different numbers of frames ({lengths}); "
+                "trim them to the same instants, or let `tricap calibrate --synchronise` find them by their sound."
+            )
         numbers = [np.arange(s.count) for s in sequences]
     known = [n for n in numbers if n is not None]
     return BoardFootage(folder=folder, names=names, sequences=sequences, numbers=tuple(known))
