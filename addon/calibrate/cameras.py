@@ -4,8 +4,10 @@ Blender stores lens, shift and pose in single precision. The calibrated values a
 long as the camera is unchanged; a camera that was made or changed in Blender is read from Blender's own values.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import bpy
 import numpy as np
@@ -28,10 +30,12 @@ def build_cameras(
     files: dict[str, list[Path]],
     tracks: dict[str, np.ndarray],
     bar: tuple[np.ndarray, np.ndarray] | None = None,
+    firsts: Mapping[str, int] = MappingProxyType({}),
 ) -> list[bpy.types.Object]:
     """Cameras in a collection of their own, with their footage as background and the measured targets as its tracks.
 
-    `bar`: frames (T,) and ends (T, 2, 3) [m] of the wand, which is built as well. Cameras that were built before are replaced.
+    `bar`: frames (T,) and ends (T, 2, 3) [m] of the wand, which is built as well. `firsts`: the image of each view at frame 0, if not its
+    first one. Cameras that were built before are replaced.
     """
     old = bpy.data.collections.get(COLLECTION)
     if old is not None:
@@ -46,9 +50,11 @@ def build_cameras(
         camera_object[EXACT] = exact_values(camera)
         if files.get(camera.name):
             clip = clips.load_clip(f"Bar {camera.name}", files[camera.name][0], camera)
+            first = firsts.get(camera.name, 0)
+            clip.frame_start -= first
             clips.show_behind(camera_object.data, clip)
             if camera.name in tracks:
-                add_tracks(clip, tracks[camera.name], camera.size_px)
+                add_tracks(clip, tracks[camera.name], camera.size_px, first)
         made.append(camera_object)
     if bar is not None:
         add_bar(collection, *bar)
@@ -58,14 +64,14 @@ def build_cameras(
     return made
 
 
-def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int, int]) -> None:
-    """The measured targets (T, 2, 2) as two tracks of the clip; the clip's own frames count from 1."""
+def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int, int], first: int = 0) -> None:
+    """The measured targets (T, 2, 2) from image `first` on as two tracks of the clip; the clip's own frames count from 1."""
     uv = axes.uv_from_pixel(xy_px, size_px)
     for end in range(2):
         visible = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
-        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(visible[0]) + 1 if len(visible) else 1)
+        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(visible[0]) + first + 1 if len(visible) else 1)
         for n in visible:
-            made.markers.insert_frame(int(n) + 1, co=tuple(uv[n, end]))
+            made.markers.insert_frame(int(n) + first + 1, co=tuple(uv[n, end]))
 
 
 def rig_of_scene(scene: bpy.types.Scene) -> Rig:

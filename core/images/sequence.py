@@ -119,6 +119,11 @@ class LaterPart:
         self._whole, self._first, self._count = whole, first, count
 
     @property
+    def first(self) -> int:
+        """The number of its frame 0 in the whole sequence."""
+        return self._first
+
+    @property
     def count(self) -> int:
         """Number of frames that are left."""
         return self._count
