@@ -28,7 +28,8 @@ def add_commands(subparsers: Any) -> None:
     if importlib.util.find_spec("bpy") is not None:
         from .movie_sound import movie_sound
 
-        subparsers.choices["synchronise"].set_defaults(movie_sound=movie_sound)
+        for name in ("synchronise", "calibrate"):
+            subparsers.choices[name].set_defaults(movie_sound=movie_sound)
     about = "a Blender file with armature, action, skins, cameras, footage, cloud and trajectories"
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")

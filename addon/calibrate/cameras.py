@@ -4,7 +4,10 @@ Blender stores lens, shift and pose in single precision. The calibrated values a
 long as the camera is unchanged; a camera that was made or changed in Blender is read from Blender's own values.
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import bpy
 import numpy as np
@@ -27,10 +30,12 @@ def build_cameras(
     files: dict[str, list[Path]],
     tracks: dict[str, np.ndarray],
     bar: tuple[np.ndarray, np.ndarray] | None = None,
+    firsts: Mapping[str, int] = MappingProxyType({}),
 ) -> list[bpy.types.Object]:
     """Cameras in a collection of their own, with their footage as background and the measured targets as its tracks.
 
-    `bar`: frames (T,) and ends (T, 2, 3) [m] of the wand, which is built as well. Cameras that were built before are replaced.
+    `bar`: frames (T,) and ends (T, 2, 3) [m] of the wand, which is built as well. `firsts`: the image of each view at frame 0, if not its
+    first one. Cameras that were built before are replaced.
     """
     old = bpy.data.collections.get(COLLECTION)
     if old is not None:
@@ -45,9 +50,11 @@ def build_cameras(
         camera_object[EXACT] = exact_values(camera)
         if files.get(camera.name):
             clip = clips.load_clip(f"Bar {camera.name}", files[camera.name][0], camera)
+            first = firsts.get(camera.name, 0)
+            clip.frame_start -= first
             clips.show_behind(camera_object.data, clip)
             if camera.name in tracks:
-                add_tracks(clip, tracks[camera.name], camera.size_px)
+                add_tracks(clip, tracks[camera.name], camera.size_px, first)
         made.append(camera_object)
     if bar is not None:
         add_bar(collection, *bar)
@@ -57,14 +64,14 @@ def build_cameras(
     return made
 
 
-def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int, int]) -> None:
-    """The measured targets (T, 2, 2) as two tracks of the clip; the clip's own frames count from 1."""
+def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int, int], first: int = 0) -> None:
+    """The measured targets (T, 2, 2) from image `first` on as two tracks of the clip; the clip's own frames count from 1."""
     uv = axes.uv_from_pixel(xy_px, size_px)
     for end in range(2):
         visible = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
-        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(visible[0]) + 1 if len(visible) else 1)
+        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(visible[0]) + first + 1 if len(visible) else 1)
         for n in visible:
-            made.markers.insert_frame(int(n) + 1, co=tuple(uv[n, end]))
+            made.markers.insert_frame(int(n) + first + 1, co=tuple(uv[n, end]))
 
 
 def rig_of_scene(scene: bpy.types.Scene) -> Rig:
@@ -107,16 +114,22 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     R, t = axes.camera_from_world(np.array(camera_object.matrix_world))
     name = str(camera_object.get("tricap_view", camera_object.name))
     matrix = np.array([[fx, 0, cx], [0, fx / aspect, cy], [0, 0, 1]])
-    read = Camera(name=name, size_px=(w, h), matrix=matrix, distortions=_distortions(clip), R_cam_world=R, t_cam_world_m=t)
-    exact = camera_object.get(EXACT)
-    return _exact_camera(read, np.array(exact)) if exact is not None and _unchanged(read, np.array(exact), clip is not None) else read
+    read = Camera(name=name, size_px=(w, h), matrix=matrix, distortions=np.zeros(5), R_cam_world=R, t_cam_world_m=t)
+    stored = camera_object.get(EXACT)
+    exact = None if stored is None else _exact_camera(read, np.array(stored))
+    read = replace(read, distortions=_distortions(clip, exact))
+    return exact if exact is not None and _unchanged(read, exact, clip is not None) else read
 
 
-def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
-    """k1 k2 p1 p2 k3 of the clip's tracking camera."""
+def _distortions(clip: bpy.types.MovieClip | None, exact: Camera | None) -> np.ndarray:
+    """k1 k2 p1 p2 k3 of the clip's tracking camera, or those of the calibrated fisheye lens if the clip still has the nearest ones."""
     if clip is None:
         return np.zeros(5)
     lens = clip.tracking.camera
+    if exact is not None and exact.fisheye and lens.distortion_model == "BROWN":
+        nearest = axes.brown_coefficients(exact)
+        if all(abs(getattr(lens, name) - value) <= SAME * max(1.0, abs(value)) for name, value in nearest.items()):
+            return exact.distortions
     if lens.distortion_model == "BROWN":
         if lens.brown_k4:
             raise InputError(
@@ -147,14 +160,13 @@ def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
     )
 
 
-def _unchanged(read: Camera, values: np.ndarray, has_lens: bool) -> bool:
+def _unchanged(read: Camera, exact: Camera, has_lens: bool) -> bool:
     """Whether Blender's values still equal the calibrated ones within single precision; `has_lens`: it has a background clip."""
-    exact = _exact_camera(read, values)
     fx = exact.matrix[0, 0] * (1 + exact.affinity[0])
     expected = np.array([fx, exact.matrix[1, 1], *exact.matrix[:2, 2], *exact.R_cam_world.ravel(), *exact.t_cam_world_m])
     got = np.array([read.matrix[0, 0], read.matrix[1, 1], *read.matrix[:2, 2], *read.R_cam_world.ravel(), *read.t_cam_world_m])
     pixels = SAME * max(read.size_px) * 4
     scale = np.array([fx * SAME * 4, fx * SAME * 4, pixels, pixels, *[SAME] * 9, *[SAME * (1 + np.abs(exact.t_cam_world_m).max()) * 4] * 3])
-    shown = np.zeros(5) if exact.fisheye else exact.distortions  # by the clip
-    distorted = has_lens and np.abs(read.distortions - shown).max() > SAME * max(1.0, np.abs(shown).max())
+    calibrated = exact.distortions
+    distorted = has_lens and np.abs(read.distortions - calibrated).max() > SAME * max(1.0, np.abs(calibrated).max())
     return bool((np.abs(expected - got) <= scale).all() and not distorted)

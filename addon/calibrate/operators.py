@@ -15,6 +15,7 @@ from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.geometry.rig import write_rig
+from ...core.images.sequence import LaterPart
 from ...core.take.bar_file import write_bar
 from .. import folders, project
 from ..jobs import JobOperator
@@ -25,7 +26,7 @@ from .cameras import build_cameras, rig_of_scene
 
 if TYPE_CHECKING:
     from ...core.calibration.boards.footage import BoardFootage
-    from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar
+    from ...core.calibration.calibrate import BarFootage, CalibratedRig, Firsts, MeasuredBar
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -41,6 +42,7 @@ class Done:
     bar: tuple[np.ndarray, np.ndarray] | None  # frames (T,) and ends (T, 2, 3) [m]
     result: "CalibratedRig"
     written: Path
+    firsts: dict[str, int]  # of views that were started one by one: the image that the others' first one belongs to
 
 
 class Calibrate(JobOperator, bpy.types.Operator):
@@ -76,6 +78,8 @@ class Calibrate(JobOperator, bpy.types.Operator):
         """Folder, target and options as they are now."""
         from ...core.calibration import calibrate
         from ...core.calibration.boards.footage import measure_boards
+        from ...core.synchronising.bar_and_board import first_images
+        from ..movie_sound import movie_sound
 
         props = context.scene.tricap_calibrate
         if not (self.bar or props.bar):
@@ -90,21 +94,25 @@ class Calibrate(JobOperator, bpy.types.Operator):
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
         board = None if props.target == "WAND" else board_of(props)
+        fps = props.started_fps
         get_session().file.bar_counts.clear()
 
+        def firsts_at(monitor: Monitor) -> "Firsts | None":
+            return None if fps <= 0 else lambda names, views: first_images(folder, names, views, fps, monitor, movie_sound)[0]
+
         def from_wand(monitor: Monitor) -> Done:
-            footage = calibrate.open_bar(folder, interlaced, mask, first_field)
+            footage = calibrate.open_bar(folder, interlaced, mask, first_field, firsts_at(monitor))
             measured = calibrate.measure_bar(footage, length, monitor, note_count, diameter or None)
             result = calibrate.calibrate_rig(measured.observations, monitor, focal_px=focal, world=world)
             return compute_wand(footage, measured, result, out)
 
         def from_board(monitor: Monitor) -> Done:
             assert board is not None
-            footage = calibrate.open_boards(folder)
+            footage = calibrate.open_boards(folder, firsts_at(monitor))
             observations = measure_boards(footage, board, monitor, note_count)
             result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
             write(result, out)
-            return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out)
+            return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out, firsts=firsts_of(footage))
 
         return from_wand if board is None else from_board
 
@@ -114,7 +122,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         missing = [name for name in views if name not in result.files]
         if views and not missing:
             use_rig(context.scene, result.result.rig, result.bar)
-        build_cameras(context.scene, result.result.rig, result.files, result.tracks, result.bar)
+        build_cameras(context.scene, result.result.rig, result.files, result.tracks, result.bar, result.firsts)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
@@ -170,6 +178,11 @@ def files_of(footage: "BarFootage | BoardFootage") -> dict[str, list[Path]]:
     return {name: list(s.files()) for name, s in zip(footage.names, footage.sequences)}
 
 
+def firsts_of(footage: "BarFootage | BoardFootage") -> dict[str, int]:
+    """The number of the first image of each view that is used."""
+    return {name: s.first if isinstance(s, LaterPart) else 0 for name, s in zip(footage.names, footage.sequences)}
+
+
 def write(result: "CalibratedRig", out: Path) -> None:
     """Write rig.toml and its report."""
     from ...core.calibration.calibrate import write_report
@@ -191,6 +204,7 @@ def compute_wand(footage: "BarFootage", measured: "MeasuredBar", result: "Calibr
         bar=(frames[first] // per, ends[first]),
         result=result,
         written=out,
+        firsts=firsts_of(footage),
     )
 
 

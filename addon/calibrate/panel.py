@@ -16,6 +16,7 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.row().prop(props, "target", expand=True)
     layout.prop(props, "bar")
     (_wand if props.target == "WAND" else _board)(layout, props)
+    layout.prop(props, "started_fps")
     layout.prop(props, "focal_px")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")

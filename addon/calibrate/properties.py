@@ -69,6 +69,14 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         precision=4,
         description="Distance between the centres of the two targets of the wand",
     )
+    started_fps: bpy.props.FloatProperty(
+        name="Started Separately [FPS]",
+        default=0.0,
+        min=0.0,
+        max=1000.0,  # type: ignore[valid-type]
+        description="Images per second of cameras that were started one by one: when each of them began is found by its sound, by light or "
+        "by time codes. 0: all films begin at the same instant",
+    )
     interlaced: bpy.props.EnumProperty(
         name="Interlacing",
         default="none",  # type: ignore[valid-type]

@@ -28,6 +28,7 @@ import numpy as np
 
 from ...core.geometry.camera import Camera
 from ...core.geometry.rotation import rotation_from_vector, vector_from_rotation
+from .fisheye import nearest_brown
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 SENSOR_WIDTH_MM = 36.0
@@ -97,8 +98,9 @@ def principal_point_bottom_up_px(camera: Camera) -> tuple[float, float]:
 
 
 def brown_coefficients(camera: Camera) -> dict[str, float]:
-    """The coefficients of the tracker's Brown model under its own names, 0 for a fisheye lens, which Blender does not have.  (5)"""
+    """The coefficients of the tracker's Brown model under its own names; of a fisheye lens, the nearest ones.  (5)"""
     if camera.fisheye:
-        return dict.fromkeys(("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2"), 0.0)
+        nearest = [float(value) for value in nearest_brown(camera)[0]]
+        return dict(zip(("brown_k1", "brown_k2", "brown_k3", "brown_k4"), nearest), brown_p1=0.0, brown_p2=0.0)
     k1, k2, p1, p2, k3 = (float(value) for value in camera.distortions)
     return dict(brown_k1=k1, brown_k2=k2, brown_k3=k3, brown_k4=0.0, brown_p1=p2, brown_p2=-p1)

@@ -7,9 +7,11 @@ from mathutils import Matrix
 from ...core.geometry.camera import Camera
 from ...core.geometry.rig import Rig
 from . import axes
+from .fisheye import nearest_brown
 
 DISPLAY_SIZE = 0.2  # of the camera's frame in the viewport, metres
 ASPECT_TOLERANCE_PX = 0.05
+FISHEYE_TOLERANCE_PX = 0.5
 
 
 def add_camera(collection: bpy.types.Collection, camera: Camera) -> bpy.types.Object:
@@ -43,10 +45,10 @@ def frame_faults(rig: Rig, reference: Camera) -> list[str]:
     faults = []
     w, h = reference.size_px
     for camera in rig.cameras:
-        if camera.fisheye:
+        if camera.fisheye and (off_px := nearest_brown(camera)[1]) > FISHEYE_TOLERANCE_PX:
             faults.append(
-                f"Camera {camera.name} has a fisheye lens, which Blender's clips do not have: the footage behind it is not undistorted. "
-                "Compare body and footage in the Clip Editor, where they agree."
+                f"Camera {camera.name} has a fisheye lens, which Blender's clips show only approximately: the footage behind it is up to "
+                f"{off_px:.1f} px off. Compare body and footage in the Clip Editor, where they agree."
             )
         if camera.size_px[0] * h != camera.size_px[1] * w:
             faults.append(

@@ -45,7 +45,7 @@ def grid(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     f, cx, cy, b1 = interior[0], *interior[1:3], interior[8]
     x, y = np.meshgrid(np.linspace(-0.5, w - 0.5, COLUMNS + 1), np.linspace(-0.5, h - 0.5, ROWS + 1))
     rays = np.stack([(x - cx) / (f * (1 + b1)), (y - cy) / f, np.ones(x.shape)], axis=-1).reshape(-1, 3)
-    xy_px = image_of(interior, rays)
+    xy_px = image_of(interior, rays, camera.fisheye)
     uv = (xy_px + 0.5) / (w, h)
     uv[:, 1] = 1.0 - uv[:, 1]
     first = (np.arange(ROWS)[:, None] * (COLUMNS + 1) + np.arange(COLUMNS)).reshape(-1, 1)

@@ -16,7 +16,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
-from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_sequence, read_image
+from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, LaterPart, open_sequence, read_image
 from . import report, verdict
 from .bars import BarObservations
 from .boards.board import Lens
@@ -66,22 +66,32 @@ class MeasuredBar:
     observations: BarObservations
 
 
-def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd") -> BarFootage:
+Firsts = Callable[[tuple[str, ...], tuple[ImageSequence, ...]], tuple[int, ...]]
+
+
+def open_bar(
+    folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd", firsts: Firsts | None = None
+) -> BarFootage:
     """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
 
     With `interlaced` "both" each image shows the bar at two instants; the `first_field` is the earlier one.
 
-    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
+    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one. `firsts` finds the
+    images of the views that were taken at once.
 
     Raises:
         InputError: the folder is missing, has fewer than two views, or views of different length; a mask belongs to no camera.
     """
     folder = Path(folder)
     names, sequences = open_views(folder, "bar")
+    sequences = sequences if firsts is None else _common(sequences, firsts(names, sequences))
     counts = {name: s.count for name, s in zip(names, sequences)}
     if len(set(counts.values())) > 1:
         lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
+        raise InputError(
+            f"The views in {folder} have different numbers of frames ({lengths}); "
+            "trim them to the same instants, or let `tricap calibrate --synchronise` find them by their sound."
+        )
     masks = () if mask is None else _masks(Path(mask), names)
     return BarFootage(folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field)
 
@@ -116,13 +126,22 @@ def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, 
     return tuple(names), tuple(sequences)
 
 
-def open_boards(folder: Path) -> BoardFootage:
-    """Open the sequences of a board in BOARDDIR: one folder of images, or one movie, per camera; images of the same number belong together.
+def _common(sequences: tuple[ImageSequence, ...], firsts: tuple[int, ...]) -> tuple[ImageSequence, ...]:
+    """What all sequences have in common if their images `firsts` were taken at once."""
+    count = min(s.count - first for s, first in zip(sequences, firsts))
+    return tuple(LaterPart(s, first, count) for s, first in zip(sequences, firsts))
+
+
+def open_boards(folder: Path, firsts: Firsts | None = None) -> BoardFootage:
+    """Open the sequences of a board in BOARDDIR: one folder of images, or one movie, per camera; images of the same number belong together,
+    or those that `firsts` finds.
 
     Raises:
         InputError: the folder is missing, has fewer than two views, or movies of different length.
     """
-    return numbered(Path(folder), *open_views(Path(folder), "board", gaps=True))
+    names, sequences = open_views(Path(folder), "board", gaps=True)
+    sequences = sequences if firsts is None else _common(sequences, firsts(names, sequences))
+    return numbered(Path(folder), names, sequences)
 
 
 def _masks(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray | None, ...]:

@@ -20,6 +20,7 @@ from .bars import sampson
 STEPS = np.arange(-3, 4)  # images of (1), as far as they are known
 FEWEST_STEPS = 4  # of them
 NEAR = 2  # images: the nearest on each side
+STILL = 1e-4  # images: a point is not interpolated for less, which would lose those without neighbours
 SEARCHED = np.arange(-8.0, 8.01, 0.5)  # images, of (3)
 REFINED = np.arange(-0.5, 0.51, 0.1)
 NEARBY = 0.2  # images: where neither this delay nor its opposite fits better than none, no other is tried
@@ -58,8 +59,8 @@ class MovingPoints:
                 a = np.where(known[:, None, None], a[:, rows], np.nan)
             tau = -float(delay) - whole
             powers = tau ** np.arange(len(a))
-            xy[:, c] = a[0] if tau == 0 else np.tensordot(powers, a, axes=1)
             velocity[:, c] = np.nan_to_num(np.tensordot(powers[:-1] * np.arange(1, len(a)), a[1:], axes=1))
+            xy[:, c] = a[0] + tau * velocity[:, c] if abs(tau) < STILL else np.tensordot(powers, a, axes=1)
         return xy, velocity
 
     def shifted(self, whole: int) -> np.ndarray:

@@ -98,8 +98,20 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     raw = without_jumps(observations.frames, observations.xy_px)
     moving = moving_points(observations.frames, raw)
     late = first_delays(moving, observations.size_px, observations.labelled)
-    if late.any():
-        observations = observations.changed(moving.at(late)[0], labelled=observations.labelled)
+    done = _at_delays(observations, raw, late, monitor, focal_px) if late.any() else None
+    if done is None:
+        done = _at_delays(observations, raw, np.zeros(len(late)), monitor, focal_px)
+    assert done is not None
+    return done
+
+
+def _at_delays(
+    observations: BarObservations, raw_px: np.ndarray, late_images: np.ndarray, monitor: Monitor, focal_px: float | None
+) -> Calibration | None:
+    """The calibration that starts from delays (C,); None if these are not 0 and turn out not to be significant: they moved the points."""
+    moving = moving_points(observations.frames, raw_px)
+    if late_images.any():
+        observations = observations.changed(moving.at(late_images)[0], labelled=observations.labelled)
     start = initial_network(observations, focal_px)
     monitor.step("calibration", 1, 5)
     network, labelled, sigma = refined_start(start.network, observations)
@@ -108,19 +120,21 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     monitor.step("calibration", 3, 5)
-    ordered = in_order(raw, observations.xy_px, labelled.xy_px, late)
-    points = moving_points(labelled.frames, without_jumps(labelled.frames, ordered), late)
+    ordered = in_order(raw_px, observations.xy_px, labelled.xy_px, late_images)
+    points = moving_points(labelled.frames, without_jumps(labelled.frames, ordered), late_images)
 
     def again(bars: BarNetwork, tolerance_px: float) -> tuple[BarNetwork, np.ndarray]:
         return with_bars(bars, labelled if bars.delay_images is None else labelled.changed(points.at(bars.delay_images)[0]), tolerance_px)
 
     delayed = with_delays(first, points, prior, sigma, again)
-    if delayed is None:
-        tested = without_outliers(first, labelled, used, prior, again)
-        return without_insignificant(*tested, labelled, monitor)
-    first, used = delayed
-    tested = without_outliers(first, labelled, used, _with_delays(prior, points), again, points)
-    return without_insignificant(*tested, labelled, monitor, points)
+    if delayed is not None:
+        first, used = delayed
+        tested = without_outliers(first, labelled, used, _with_delays(prior, points), again, points)
+        return without_insignificant(*tested, labelled, monitor, points)
+    if late_images.any():
+        return None
+    tested = without_outliers(first, labelled, used, prior, again)
+    return without_insignificant(*tested, labelled, monitor)
 
 
 def with_delays(

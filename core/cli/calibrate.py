@@ -4,6 +4,7 @@ import argparse
 import json
 import re
 from dataclasses import replace
+from functools import partial
 
 from ..calibration import report
 from ..calibration.bars import BarObservations
@@ -16,6 +17,7 @@ from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
+from ..images.sequence import ImageSequence
 from ..take.bar_file import write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
@@ -106,14 +108,33 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
     if args.json:
         return [json.dumps(report.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
     remarks = [f"{line[0].upper()}{line[1:]}." for line in result.calibration.remarks]
-    return [result.verdict.sentence, f"To improve: {result.verdict.advice}.", *remarks, f"Written: {', '.join(map(str, written))}"]
+    return [
+        *args.started,
+        result.verdict.sentence,
+        f"To improve: {result.verdict.advice}.",
+        *remarks,
+        f"Written: {', '.join(map(str, written))}",
+    ]
 
 
 def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> BarObservations | BoardObservations:
+    firsts = None if args.synchronise is None else partial(_first_images, args, monitor)
     if board is not None:
-        return measure_boards(open_boards(args.bar), board, monitor)
-    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field)
+        return measure_boards(open_boards(args.bar, firsts), board, monitor)
+    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field, firsts)
     return measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations
+
+
+def _first_images(
+    args: argparse.Namespace, monitor: Monitor, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]
+) -> tuple[int, ...]:
+    from ..synchronising.bar_and_board import first_images
+
+    if not 0.1 <= args.synchronise <= 10_000:
+        raise InputError(f"--synchronise is {args.synchronise:g}; give the images per second of all views, such as 30.")
+    firsts, timings = first_images(args.bar, names, sequences, args.synchronise, monitor, args.movie_sound)
+    args.started = [str(timing) for timing in timings]
+    return firsts
 
 
 def _world(args: argparse.Namespace) -> WorldChoice:

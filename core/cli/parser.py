@@ -151,6 +151,9 @@ def _calibrate(commands: Any) -> None:
     about = "with a board: the model of the lenses; auto: of each camera the one that fits its images"
     parser.add_argument("--lens", choices=LENSES, default="auto", help=about)
     parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")
+    about = "images per second; finds when each view began: by sound (NAME.wav; in Blender the movie's own), light or time codes"
+    parser.add_argument("--synchronise", type=float, metavar="F", help=about)
+    parser.set_defaults(movie_sound=None, started=[])  # the add-on's command reads that of movies
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument(
         "--interlaced",

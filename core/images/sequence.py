@@ -113,6 +113,40 @@ class ImageFiles:
         return self._top
 
 
+class LaterPart:
+    """A sequence without its first images."""
+
+    def __init__(self, whole: ImageSequence, first: int, count: int) -> None:
+        self._whole, self._first, self._count = whole, first, count
+
+    @property
+    def first(self) -> int:
+        """The number of its frame 0 in the whole sequence."""
+        return self._first
+
+    @property
+    def count(self) -> int:
+        """Number of frames that are left."""
+        return self._count
+
+    @property
+    def source(self) -> str:
+        """Where the frames come from."""
+        return self._whole.source
+
+    def read(self, index: int) -> np.ndarray:
+        """Grey values (h, w) float32 of frame `index` of the part."""
+        return self._whole.read(self._first + index)
+
+    def read_colour(self, index: int) -> np.ndarray:
+        """RGB values (h, w, 3) float32 of frame `index` of the part."""
+        return self._whole.read_colour(self._first + index)
+
+    def files(self) -> tuple[Path, ...]:
+        """The files behind the whole sequence."""
+        return self._whole.files()
+
+
 class Movie:
     """A movie file, decoded frame by frame; reading in order is fast, reading backwards starts again."""
 

@@ -3,7 +3,7 @@ doi:10.1109/TASSP.1976.1162830).
 
     R(τ) = F⁻¹[ A(f) B*(f) / |A(f) B*(f)| ]                                                  (1)
 
-Pieces of the second recording are searched in all of the first one; where several of them agree on a delay, short pieces from everywhere
+Pieces of the shorter recording are searched in all of the longer one; where several of them agree on a delay, short pieces from everywhere
 give the delay over time, and a robust line through it
 
     t_a = D + (1 + k) t_b                                                                    (2)
@@ -120,7 +120,11 @@ def offset_between(a: Sound, b: Sound, monitor: Monitor) -> SoundOffset | None:
     """
     if a.silent or b.silent:
         return None
-    coarse_s = _coarse(a.samples, b.samples, monitor)
+    if len(a.samples) < len(b.samples):  # what both recorded may be a small part of the longer one
+        back_s = _coarse(b.samples, a.samples, monitor)
+        coarse_s = None if back_s is None else -back_s
+    else:
+        coarse_s = _coarse(a.samples, b.samples, monitor)
     return None if coarse_s is None else _line(a.samples, b.samples, coarse_s, monitor)
 
 

@@ -14,6 +14,7 @@ from tricap.core.synthetic.bar import BarNoise, BarPictures, benchmark_cameras, 
 from tricap.core.synthetic.board import held_board, picture_of_board
 from tricap.core.take.bar_file import read_bar
 
+from ..core.synchronising.test_synchronise import heard, world, write_wav
 from .conftest import small_rig
 from .layout import Layout
 
@@ -47,6 +48,28 @@ def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     assert kept is not None
     np.testing.assert_allclose(kept[1], ends, atol=1e-5)
     assert rig["C"].size_px == tuple(clip.size)
+
+
+def test_cameras_that_were_started_one_by_one(blender, empty, bar: Path, tmp_path: Path) -> None:
+    """R began three images after the others; its sound says so."""
+    room = world(12.0)
+    for view, first in (("L", 0), ("C", 0), ("R", 3)):
+        (tmp_path / "loose" / view).mkdir(parents=True)
+        for n, file in enumerate(sorted((bar / view).glob("*.png"))[first:]):
+            (tmp_path / "loose" / view / f"{n:04d}.png").symlink_to(file)
+        write_wav(tmp_path / "loose" / f"{view}.wav", heard(room, 1.0 + first / 25, 9.0, seed=ord(view)).samples)
+    props = empty.context.scene.tricap_calibrate
+    props.bar, props.length_m, props.started_fps = str(tmp_path / "loose"), 0.5, 25.0
+    assert empty.ops.tricap.calibrate() == {"FINISHED"}
+    assert props.light != "red"
+    clips = empty.data.movieclips
+    assert [clips[f"Bar {view}"].frame_start for view in "LCR"] == [-3, -3, 0]
+    places = {}
+    for view, first in (("L", 3), ("R", 0)):
+        markers = clips[f"Bar {view}"].tracking.tracks[0].markers
+        assert min(m.frame for m in markers) == first + 1 and max(m.frame for m in markers) <= first + 37
+        places[view] = len(markers)
+    assert min(places.values()) > 20
 
 
 def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_path: Path) -> None:

@@ -83,7 +83,9 @@ def _first_adjustment(
     observations: BoardObservations, moving: MovingPoints | None, monitor: Monitor, lenses: Lenses
 ) -> "tuple[Adjusted[BoardNetwork], np.ndarray, _Placed, Unknowns]":
     """A robust adjustment from nothing: the network, the image points used, the positions, and the prior with delays if they matter."""
-    if moving is not None and moving.expected_images.any():
+    late = moving is not None and bool(moving.expected_images.any())
+    at_once = observations
+    if moving is not None and late:
         observations = observations.changed(moving.at(moving.expected_images)[0])
     started = initial_network(observations, lenses)
     monitor.step("calibration", 1, 5)
@@ -95,6 +97,8 @@ def _first_adjustment(
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     placed = _Placed(labelled=labelled, moving=moving)
     delayed = None if placed.points is None else with_delays(first, placed.points, prior, sigma, placed.again)
+    if delayed is None and moving is not None and late:  # the delays are not significant, and moved the points
+        return _first_adjustment(at_once, replace(moving, expected_images=np.zeros_like(moving.expected_images)), monitor, lenses)
     if delayed is None:
         return first, used, _Placed(labelled=labelled, moving=None), prior
     return *delayed, placed, replace(prior, expected_delay_images=placed.expected_images)

@@ -21,6 +21,7 @@ MOST_STILLS = 60  # of a view: so few images are searched thoroughly
 TRIED_IMAGES = 24  # in which the variant is looked for
 GUESSED_IMAGES = 6  # in which other markers are looked for
 MOST_POSITIONS = 240  # that are adjusted
+NEAR_SIZES = ((-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1))  # by which a board is looked for that has another size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -44,7 +45,10 @@ def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequenc
         counts = {name: s.count for name, s in zip(names, sequences)}
         if len(set(counts.values())) > 1:
             lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
-            raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
+            raise InputError(
+                f"The views in {folder} have different numbers of frames ({lengths}); "
+                "trim them to the same instants, or let `tricap calibrate --synchronise` find them by their sound."
+            )
         numbers = [np.arange(s.count) for s in sequences]
     known = [n for n in numbers if n is not None]
     return BoardFootage(folder=folder, names=names, sequences=sequences, numbers=tuple(known))
@@ -168,9 +172,25 @@ def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> 
         for other in DICTIONARIES:
             if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:2])[1]:
                 raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
+    elif (other_size := _other_size(images[:: max(1, len(images) // GUESSED_IMAGES)], board)) is not None:
+        raise InputError(
+            f"{start} {counted}, but one of {other_size.label}: inner corners are where four squares meet; give {other_size.label}."
+        )
     raise InputError(
         f"{start} {counted}; check the numbers of {counted} across and down, and hold the whole board in the image, flat, lit and close."
     )
+
+
+def _other_size(images: list[np.ndarray], board: Board) -> Board | None:
+    """The chessboard that the images show instead: the squares were counted, not the inner corners, or a row or column was miscounted."""
+    for across, down in NEAR_SIZES:
+        try:
+            guess = Board(kind=board.kind, squares=(board.squares[0] + across, board.squares[1] + down), square_m=board.square_m)
+        except InputError:  # too few corners
+            continue
+        if any(np.isfinite(find_corners(image, guess)).any() for image in images):
+            return guess
+    return None
 
 
 def _other_markers(board: Board, dictionary: str) -> Board | None:

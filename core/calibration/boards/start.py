@@ -314,14 +314,15 @@ def _chained(observations: BoardObservations, cameras: tuple[Camera, ...], plane
 
 def _refuse_alone(observations: BoardObservations, plane: PlanePoses, alone: list[int], joined: list[int], count: int) -> None:
     names = ", ".join(observations.names[c] for c in alone)
+    who, share, do = (f"Camera {names}", "shares", "does") if len(alone) == 1 else (f"Cameras {names}", "share", "do")
     shared = max(int((plane.shown[:, c] & plane.shown[:, d]).sum()) for c in alone for d in joined)
     if shared < FEWEST_SHARED:
         raise InputError(
-            f"Camera {names} shares only {shared} positions of the board with the other cameras; at least {FEWEST_SHARED} are needed, and "
+            f"{who} {share} only {shared} positions of the board with the other cameras; at least {FEWEST_SHARED} are needed, and "
             "20 are good: hold the board where several cameras see it at the same instant."
         )
     raise InputError(
-        f"Camera {names} does not agree with the other cameras: of {shared} positions of the board that it shares with one of them, only "
+        f"{who} {do} not agree with the other cameras: of {shared} positions of the board that are shared with one of them, only "
         f"{count} fit one rig; check that the recordings start at the same instant, and that no camera was moved or mirrored."
     )
 

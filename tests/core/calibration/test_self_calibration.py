@@ -8,6 +8,7 @@ import pytest
 from tricap.core.calibration import report
 from tricap.core.calibration.bundle import Unknowns
 from tricap.core.calibration.calibrate import calibrate_rig
+from tricap.core.calibration.delays import first_delays, moving_points, without_jumps
 from tricap.core.calibration.precision import predicted_error, with_left_out
 from tricap.core.calibration.quality import held_out_lengths
 from tricap.core.calibration.self_calibration import calibrate
@@ -225,9 +226,19 @@ def test_cameras_that_are_not_in_step_are_calibrated_as_well(delay_images: tuple
     assert "Camera R took its images" in page and "than camera L; the adjustment allows for it." in page
 
 
+def test_delays_that_turn_out_not_to_be_significant_leave_no_trace() -> None:
+    """Pairs of these synchronised cameras seem to be 0.1 images apart at first; points moved by that gave a rig that was wrong by 3 mm."""
+    together = waved_out_of_step(12, (0.0, 0.0, 0.0))
+    moving = moving_points(np.arange(300), without_jumps(np.arange(300), together.xy_px))
+    assert first_delays(moving, observed(together).size_px, labelled=True).any()
+    done = calibrate(observed(together), Monitor())
+    assert not done.delays and done.sigma0_px == pytest.approx(0.05, rel=0.05)
+    assert error_m(together.cameras, done.network.cameras(done.observations.names, done.observations.size_px)) < 3e-4
+
+
 @pytest.mark.slow
 def test_delays_are_found_to_a_third_of_a_millisecond() -> None:
-    off, ratios = [], []
+    off, apart_m, together_m = [], [], []
     for seed in range(24):
         rng = np.random.default_rng(seed)
         delay = (0.0, *rng.uniform(-0.5, 0.5, 2))
@@ -236,6 +247,8 @@ def test_delays_are_found_to_a_third_of_a_millisecond() -> None:
         assert done.network.delay_images is not None
         off.append((done.network.delay_images - delay) * 1e3 / 30)
         cameras = done.network.cameras(done.observations.names, done.observations.size_px)
-        ratios.append(error_m(apart.cameras, cameras) / (ratio(together, 0.05) * bound(together, 0.05).rms_m))
+        apart_m.append(error_m(apart.cameras, cameras))
+        together_m.append(ratio(together, 0.05) * bound(together, 0.05).rms_m)
     assert np.sqrt(np.mean(np.square(off))) < 0.3  # measured: 0.005
-    assert np.median(ratios) < 1.3, ratios  # measured: 1.22, with 2 % of wrong points and 10 % missing
+    rms = np.sqrt(np.mean(np.square(apart_m)) / np.mean(np.square(together_m)))
+    assert rms < 1.2, (apart_m, together_m)  # measured: 1.16 (median of the ratios 1.21), with 2 % of wrong points and 10 % missing

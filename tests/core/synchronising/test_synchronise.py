@@ -50,6 +50,14 @@ def test_sound_gives_the_start_and_the_drift(start_s: float, seconds: float, dri
     assert abs(found.offset_s + found.drift * middle - start_s - drift * middle) < 1e-4 and found.sigma_s < 1e-4
 
 
+def test_a_recording_that_began_minutes_before_a_short_one_is_found() -> None:
+    """Both share the last 9 of its 200 seconds."""
+    room = world(209.0)
+    a, b = heard(room, 195.0, 9.0, seed=2), heard(room, 4.0, 200.0, seed=3, drift=50e-6)
+    found = offset_between(a, b, Monitor())
+    assert found is not None and abs(found.offset_s + found.drift * 195.5 - (4.0 - 195.0) - 50e-6 * 195.5) < 1e-4
+
+
 def test_unrelated_and_silent_sounds_have_nothing_in_common() -> None:
     room = world(60.0)
     a = heard(room, 0.0, 60.0, seed=2)
