@@ -54,6 +54,13 @@ def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, 
         column.label(text=line, icon=icon if n == 0 else "NONE" if icon == "NONE" else "BLANK1")
 
 
+def expanded(layout: bpy.types.UILayout, data: bpy.types.bpy_struct, name: str) -> None:
+    """The choices of a property side by side over the full width, so that their names are legible in a narrow sidebar."""
+    row = layout.row()
+    row.use_property_split = False
+    row.prop(data, name, expand=True)
+
+
 def wrapped(text: str, width: int) -> list[str]:
     """The lines of a text."""
     return [line for part in text.splitlines() for line in textwrap.wrap(part, width)]

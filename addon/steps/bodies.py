@@ -13,7 +13,7 @@ from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..editing import operators as editing
 from ..operators import control_rig
-from ..panels import sentence
+from ..panels import expanded, sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
 from ..scene import footage_plane, metaballs, standing
@@ -219,7 +219,7 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
 def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Export; retargeting is a section of its own."""
     props = context.scene.tricap_retarget
-    layout.row().prop(props, "export_source", expand=True)
+    expanded(layout, props, "export_source")
     if props.export_source == "PLAYED":
         layout.prop(props, "export")
     button = layout.operator_menu_enum("tricap.export", "kind", text="Export Motion", icon="EXPORT")

@@ -165,7 +165,9 @@ def _footage(scene: bpy.types.Scene, found: _Project) -> State:
         raise FixableError(str(error), Fix.COMMON_FRAMES) from error
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
     rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} fps"
-    return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.")
+    assumed = not props.is_property_set("fps") and any(view.images for view in take.views)
+    doubt = f" Images have no frame rate; {rate} is assumed. Enter FPS." if assumed else ""
+    return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.{doubt}")
 
 
 def _cameras(scene: bpy.types.Scene, found: _Project) -> State:

@@ -56,8 +56,9 @@ def why(states: ModuleType, blender: ModuleType) -> Callable[[str], str]:
 
 
 def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
-    """A saved file with the sample's footage added, as a user would."""
+    """A saved file with the sample's footage added, as a user would; its calibration is in another folder."""
     shutil.copytree(sample, folder / "film")
+    (folder / "film" / "rig.toml").rename(folder / "rig.toml")
     for name in ("take.toml", "truth.npz"):
         (folder / "film" / name).unlink()
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
@@ -87,8 +88,10 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     scene = new_project(blender, sample, tmp_path)
     assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
     assert words() == "done ready done empty empty empty empty empty"
+    assert why("footage").startswith("3 views, 3 frames of 512×384 pixels, 25 fps. Images have no frame rate; 25 fps is assumed.")
+    scene.tricap.fps = 25.0
     assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 fps."
-    assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
+    assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "rig.toml")) == {"FINISHED"}
     assert "Camera L" in scene.objects and scene.camera.name == "Camera C", "the cameras stand in the viewport"
     scene.tricap.model = "arm.R"
     assert words() == "done done ready ready empty empty empty empty"
@@ -471,6 +474,22 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
         blender.context.view_layer.update()
         watch._tick()
         assert watch.current(scene) is not known
+
+
+def test_a_calibration_in_the_folder_of_the_footage_is_used(
+    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path
+) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    shutil.copytree(sample, tmp_path / "film")
+    (tmp_path / "film" / "take.toml").unlink()
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    assert words().startswith("done done") and blender.context.scene.camera.name == "Camera C"
+    (tmp_path / "film" / "rig.toml").write_text("damaged")
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    assert words().startswith("done ready") and not (tmp_path / "other_tricap" / "rig.toml").exists()
 
 
 def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: Path, tmp_path: Path) -> None:

@@ -340,6 +340,11 @@ def reports() -> list[str]:
         area.type = before
 
 
+def command(*words: str) -> list[str]:
+    """The `tricap` command of this Blender; of the module, which has no program, that of its Python."""
+    return [bpy.app.binary_path, "--command", "tricap", *words] if bpy.app.binary_path else [sys.executable, "-m", "tricap", *words]
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
