@@ -210,7 +210,9 @@ def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
     complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
     if take.body_model in START_ALONE and len(complete) < len(wanted):
         others = f"{len(complete)} of {len(wanted)} joints are clicked, the others are" if complete else "The joints are"
-        return State(status=Status.DONE, message=f"{others} found by the fit, which asks for a click where it is not certain.")
+        part = "Choose another Body if only a part of the person is filmed."
+        message = f"{others} found by the fit, which asks for a click where it is not certain. {part}"
+        return State(status=Status.DONE, message=message)
     if len(complete) < min(NEEDED_JOINTS, len(wanted)):
         return State(status=Status.READY, message=f"Click each joint in at least two views: {len(complete)} of {len(wanted)} so far.")
     missing = [name for name in wanted if name not in complete]

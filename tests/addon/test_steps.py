@@ -419,6 +419,7 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
     for n, title in enumerate(states.TITLES, 1):
         assert f"{n}  {title}" in drawn.texts
     assert {"empty": "tricap.open_take", "opened": "tricap.measure", "done": "tricap.export"}[point] in drawn.operators
+    assert point == "empty" or drawn.properties.count("model") == {"opened": 2, "done": 1}[point], "the body is shown before the run"
     if point == "done":
         assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
         assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
