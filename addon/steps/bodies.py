@@ -173,8 +173,12 @@ def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
 
 
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Fit the body; locked and limited degrees of freedom."""
-    _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
+    """Fit the body, or click the joint that the fit asks for; locked and limited degrees of freedom."""
+    asked = watch.current(context.scene).states["body"].click
+    if asked is not None:
+        button = primary(layout, "tricap.click_joints", True, icon="RESTRICT_SELECT_OFF", text=f"Click {asked[0]} in Frame {asked[1]}")
+        button.only, button.frame = asked
+    _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")
     draw_dofs(layout, context.scene)

@@ -74,6 +74,7 @@ class State:
     status: Status
     message: str = ""
     fix: Fix | None = None
+    click: tuple[str, int] | None = None  # the joint and the frame whose click the fit asks for
 
 
 @dataclass(frozen=True, kw_only=True)

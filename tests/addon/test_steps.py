@@ -170,6 +170,34 @@ def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, 
     assert words().split()[3:7] == ["done", "done", "done", "done"]
 
 
+def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
+    blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It leads to the joint in its frame; surface and tracks stand in the viewport meanwhile."""
+    core = NAME.removesuffix("addon") + "core"
+    starts, stages = (importlib.import_module(f"{core}.{name}") for name in ("fitting.inputs.start_joints", "run.pipeline"))
+    watch, panel = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("watch", "panel"))
+    start = starts.StartJoints(frame=2, xyz_m={}, stature=1.0, model="full", probability=0.6, rivals={"front and back": 0.4}, ask="wrist.R")
+
+    def fit(run: Any, monitor: Any) -> None:
+        raise starts.NeedsClick(start)
+
+    shutil.copytree(results, tmp_path / "out")
+    scene = opened(blender, sample, tmp_path)
+    scene.tricap.fitting.gate_m = 0.04
+    monkeypatch.setattr(stages, "fit", fit)
+    for operator in (blender.ops.tricap.fit, blender.ops.tricap.run):
+        with pytest.raises(RuntimeError, match="Click the right wrist in two views of frame 2"):
+            operator()
+        state = watch.current(scene).states["body"]
+        assert words().split()[3:6] == ["done", "done", "failed"] and state.click == ("wrist.R", 2)
+        assert {"Camera L", "Cloud", "Trajectories"} <= set(scene.objects.keys())
+    assert "tricap.click_joints" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
+    assert scene.tricap.seed_frame == 0
+    scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers.insert_frame(3, co=(0.5, 0.5))
+    assert words().split()[3:5] == ["done", "done"] and watch.current(scene).states["body"].click is None
+
+
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
     scene, out = done, tmp_path / "out"
