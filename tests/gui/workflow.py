@@ -208,9 +208,8 @@ def edited(file: Path) -> drive.Steps:
     for thing in scene.objects:
         thing.select_set(thing == target)
     bpy.context.view_layer.objects.active = target
-    yield from drive.move(*drive.middle(area))
-    yield from drive.key("TAB", ctrl=True)
-    drive.need(target.mode == "POSE", "the character is in pose mode")
+    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+        bpy.ops.object.mode_set(mode="POSE")
     target.data.bones.active = target.data.bones["forearm.R"]
     selected = target.pose.bones if bpy.app.version >= (5, 0) else target.data.bones
     for bone in selected:
@@ -219,6 +218,7 @@ def edited(file: Path) -> drive.Steps:
     yield from drive.settle()
     before = direction(target, "forearm.R")
     x, y = drive.middle(area)
+    yield from drive.move(x, y)
     yield from drive.key("R")
     for step in range(8):
         yield from drive.move(x, y + 12 * step)
@@ -226,7 +226,6 @@ def edited(file: Path) -> drive.Steps:
     yield from drive.key("I")
     turned = math.degrees(before.angle(direction(target, "forearm.R")))
     drive.check(turned > EDITED_DEG, f"the forearm was turned by {turned:.1f}°")
-    yield from drive.key("TAB", ctrl=True)
     yield from drive.shot("5_edited")
     scene.tricap_retarget.export_source, scene.tricap_retarget.export = "PLAYED", target
     area = yield from drive.sidebar("VIEW_3D", "Tricap")
@@ -242,10 +241,10 @@ def read_back(file: Path, target: bpy.types.Object) -> None:
     off_m, off_deg = [], []
     for row, frame in enumerate(range(scene.frame_start, scene.frame_end + 1)):
         scene.frame_set(frame)
-        for name in ("upper_arm.R", "forearm.R", "hand.R"):
-            b = found.rig.index[name]
-            off_m.append((target.matrix_world @ target.pose.bones[name].head - Vector(found.head_m[row, b])).length)
-            off_deg.append(math.degrees(direction(target, name).angle(Vector(found.R[row, b, :, 1]))))
+        for name, next_name in (("upper_arm.R", "forearm.R"), ("forearm.R", "hand.R")):
+            here, there = (Vector(found.head_m[row, found.rig.index[each]]) for each in (name, next_name))
+            off_m.append((target.matrix_world @ target.pose.bones[name].head - here).length)
+            off_deg.append(math.degrees(direction(target, name).angle(there - here)))
     drive.check(max(off_m) < READ_BACK_M and max(off_deg) < READ_BACK_DEG, f"read back, off by {max(off_m):.1e} m, {max(off_deg):.1e}°")
 
 
