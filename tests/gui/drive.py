@@ -385,7 +385,7 @@ def run(script: str) -> None:
         sys.stdout.flush()
         os._exit(code)
 
-    bpy.app.timers.register(step, first_interval=1.0)
+    bpy.app.timers.register(step, first_interval=1.0, persistent=True)  # a script may open another file
 
 
 def _with_picture(steps: Steps) -> Steps:
