@@ -38,7 +38,8 @@ def run_script(
         shutil.copyfile(package, folder / "tricap.zip")
         (folder / "out").mkdir()
         with _display(root, inside, size) as display:
-            home, cache = (folder, root / SHARE / "cache") if module else (inside, Path("/") / SHARE / "cache")
+            # Each has a cache of its own: two versions of the renderer Mesa that share one end each other (SIGBUS).
+            home, cache = (folder, root / SHARE / "module_cache") if module else (inside, Path("/") / SHARE / "cache")
             environment = _environment(home, cache, display)
             _install([sys.executable, MODULE, "--install", home / "tricap.zip"] if module else _installing(root, home), environment)
             blender = [sys.executable, MODULE] if module else ["chroot", root, "blender"]
