@@ -16,7 +16,7 @@ from .. import folders, project
 from ..calibrate.cameras import rig_of_scene
 from ..operators.build_scene import show_so_far
 from ..scene import clips
-from .footage import SimpleOperator
+from .simple_operator import SimpleOperator
 
 IN_FOLDER = ("rig.toml", "camera_array.toml", "calibration.toml", "Calib.toml")  # Tricap, caliscope, Anipose, Pose2Sim
 

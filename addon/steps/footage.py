@@ -12,21 +12,12 @@ from ...core.images.sequence import open_sequence
 from ...core.take.footage_files import copy_take, find_footage, find_moved, name_views, take_files
 from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
-from ..panels import TellingOperator, sentence
+from ..panels import sentence
 from . import watch
+from .cameras import use_calibration_in
+from .simple_operator import SimpleOperator
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
-
-
-class SimpleOperator(TellingOperator):
-    """Mix-in: the steps' states are computed again after the work."""
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do it."""
-        try:
-            return super().execute(context)
-        finally:
-            watch.refresh(context.scene)
 
 
 class AddFootage(SimpleOperator, bpy.types.Operator):
@@ -79,8 +70,6 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
         if not project.bound(scene) and take_files(place, names):
             return self._add_take(scene, place, fps)
         said = self._add_files(scene, place, names, fps)
-        from .cameras import use_calibration_in
-
         return f"{said}{use_calibration_in(self, context, place)}"
 
     def _add_take(self, scene: bpy.types.Scene, place: Path, fps: float) -> str:
