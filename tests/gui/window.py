@@ -103,6 +103,7 @@ def _environment(home: Path, cache: Path, display: str) -> dict[str, str]:
         "LIBGL_ALWAYS_SOFTWARE": "1",
         "BLENDER_USER_RESOURCES": str(home / "profile"),
         "PYTHONUNBUFFERED": "1",
+        "PYTHONFAULTHANDLER": "1",  # the module's Python says where it crashed
         "OPENBLAS_NUM_THREADS": "1",
         "LC_ALL": "C.UTF-8",
     }

@@ -16,7 +16,7 @@ from bl_ext.user_default.tricap.core.synthetic.arm import ArmTakeSettings, make_
 from bl_ext.user_default.tricap.core.take.take import read_take
 from mathutils import Vector
 
-CLICK_ERROR_PX = 5.0
+CLICK_ERROR_PX, SNAP_PX = 5.0, 6.0
 LAYOUT, CLICKS = "Layout", "Tricap Clicks"
 EXPORT_UP_PX = 56  # from the field Source to the menu of formats: two rows
 MET_DEG = 0.1  # between a limb of the body and the character's
@@ -119,14 +119,15 @@ def view_of(area: bpy.types.Area) -> str:
 
 
 def check_clicks(wanted: Joints) -> None:
-    """Each joint is clicked in each view, as close as it was meant to be; one screen pixel more is allowed."""
-    for view in bpy.context.scene.tricap.views:
+    """Each joint is clicked in each view, as close as it was meant to be, or on the ring to which it snapped, to a screen pixel."""
+    for n, view in enumerate(bpy.context.scene.tricap.views):
         size, tracks, areas = view.clip.size, view.clip.tracking.tracks, {view_of(a): a for a in clip_areas()}
         pixel = 1 / display.pixel_of(areas[view.name])
+        limit_px = CLICK_ERROR_PX + pixel * (1 + (SNAP_PX if n else 0))
         for name, at in wanted.items():
             co = tracks[name].markers[0].co if name in tracks else (0.0, 0.0)
             off = max(abs(co[0] * size[0] - 0.5 - at[view.name][0]), abs((1 - co[1]) * size[1] - 0.5 - at[view.name][1]))
-            drive.check(off <= CLICK_ERROR_PX + pixel, f"{name} in {view.name} is clicked {off:.1f} px beside it")
+            drive.check(off <= limit_px, f"{name} in {view.name} is clicked {off:.1f} px beside it")
 
 
 def body() -> drive.Steps:
