@@ -355,20 +355,21 @@ def blender_extension(command: str, *arguments: object) -> None:
         sys.exit(f"Blender's extension tool found a fault ({command}):\n{done.stdout}{done.stderr}")
 
 
-def gui_test(out: str, scripts: list[str], install: bool) -> int:
-    """Tricap in a true Blender window (tests/gui). Debian's Blender has Python 3.14 and a scipy of its own; the other wheels fit any."""
+def gui_test(out: str, scripts: list[str], install: bool, module: bool) -> int:
+    """Tricap in a true Blender window (tests/gui): Debian's, or that of the module for this Python (3.11: Blender 4.5, 3.13: 5.2)."""
     with tempfile.TemporaryDirectory() as folder:
-        package = build_for_window(Path(folder))
-        said = ["--package", package, "--out", Path(out).absolute(), *(["--install"] if install else []), *scripts]
+        package = build_for_window(Path(folder), module)
+        more = [*(["--install"] if install else []), *(["--module"] if module else [])]
+        said = ["--package", package, "--out", Path(out).absolute(), *more, *scripts]
         return run(venv_program("python"), ROOT / "tests" / "gui" / "run.py", *said)
 
 
-def build_for_window(out: Path) -> Path:
-    """The extension with only those wheels that serve every Python."""
+def build_for_window(out: Path, module: bool) -> Path:
+    """The extension for Linux. Debian's Blender has Python 3.14 and a scipy of its own: without `module`, only wheels for any Python."""
     import tomllib
 
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
-    wheels = [name for name in manifest["wheels"] if serves(name, "linux-x64") and ("-abi3-" in name or "-none-" in name)]
+    wheels = [name for name in manifest["wheels"] if serves(name, "linux-x64") and (module or "-abi3-" in name or "-none-" in name)]
     for wheel in wheels:
         fetch_wheel(ROOT / wheel)
     return build_one(manifest, "linux-x64", wheels, out)
@@ -397,6 +398,7 @@ def parser() -> argparse.ArgumentParser:
     part = commands.add_parser("gui-test", help="the workflow in a true Blender window (set up in .gui; Linux, as root)")
     part.add_argument("--out", default=str(ROOT / "out" / "gui"), help="folder of pictures and logs (default: out/gui)")
     part.add_argument("--install", action="store_true", help="install debootstrap where it is missing (apt-get)")
+    part.add_argument("--module", action="store_true", help="the window of Blender's module for this Python: 4.5 LTS under Python 3.11")
     part.add_argument("script", nargs="*", help="only these scripts")
     commands.add_parser("lint", help="style and types")
     return top
@@ -418,7 +420,7 @@ def main() -> int:
     if options.command == "bench":
         return bench(options.stage, options.json, options.save)
     if options.command == "gui-test":
-        return gui_test(options.out, options.script, options.install)
+        return gui_test(options.out, options.script, options.install, options.module)
     return lint() if options.command == "lint" else 0
 
 

@@ -225,6 +225,9 @@ class JobOperator:
         """Main thread: write the result to the scene; returns the operator's result."""
         raise NotImplementedError
 
+    def after_error(self, context: bpy.types.Context) -> None:
+        """Main thread: show what there is after an error; nothing by itself."""
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Blocking driver, for scripts and background."""
         job = self._prepare(context)
@@ -295,11 +298,12 @@ class JobOperator:
             except Exception as bug:  # the edge of the job: whatever happens is reported, and the panel learns that the job has ended
                 error, job.trace = bug, traceback.format_exc()
         if error is not None:
+            self.after_error(context)
             self._report_error(job, error)
         stopped = str(error) if isinstance(error, Cancelled) else ""
         failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _message(error)
         for listener in get_session().on_job_end:
-            listener(context, job.step, failed, stopped)
+            listener(context, job.step, failed, stopped, error)
         return ended
 
     def _report_error(self, job: Job, error: BaseException) -> None:

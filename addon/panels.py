@@ -1,13 +1,16 @@
 """Shared by panels and buttons: their place, what an operator says, wrapped sentences, and the status bar. draw() only draws."""
 
-import textwrap
+from collections.abc import Callable
 
+import blf
 import bpy
 
 from ..core.foundation.errors import sentence_of
 from .session import get_session
 
-CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
+# of a sidebar, at the interface's usual scale: what is left and right of its texts, the icon before them, and texts at least
+MARGIN_PX, ICON_PX, NARROW_PX = 62, 22, 130
+FONT = 0  # Blender's own, in which labels are drawn
 
 
 class TricapPanel:
@@ -46,17 +49,35 @@ class TellingOperator:
 
 def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
     """A sentence, wrapped to the sidebar's width, with the icon before its first line."""
-    region = context.region
-    width = region.width / context.preferences.system.ui_scale if region is not None else 0
+    region, scale = context.region, context.preferences.system.ui_scale or 1.0  # 0 in the background
+    width = region.width / scale - MARGIN_PX - (ICON_PX if icon != "NONE" else 0) if region is not None else 0
+    blf.size(FONT, context.preferences.ui_styles[0].widget.points)
     column = layout.column(align=True)
     column.scale_y = 0.85
-    for n, line in enumerate(wrapped(text, max(NARROW, int((width - MARGIN_PX) / CHARACTER_PX)))):
+    for n, line in enumerate(wrapped(text, max(NARROW_PX, width), lambda part: blf.dimensions(FONT, part)[0])):
         column.label(text=line, icon=icon if n == 0 else "NONE" if icon == "NONE" else "BLANK1")
 
 
-def wrapped(text: str, width: int) -> list[str]:
-    """The lines of a text."""
-    return [line for part in text.splitlines() for line in textwrap.wrap(part, width)]
+def expanded(layout: bpy.types.UILayout, data: bpy.types.bpy_struct, name: str) -> None:
+    """The choices of a property side by side over the full width, so that their names are legible in a narrow sidebar."""
+    row = layout.row()
+    row.use_property_split = False
+    row.prop(data, name, expand=True)
+
+
+def wrapped(text: str, width: float, measure: Callable[[str], float]) -> list[str]:
+    """The lines of a text that are at most so wide, by `measure`; a word that is wider has a line of its own."""
+    lines: list[str] = []
+    for part in text.splitlines():
+        line = ""
+        for word in part.split():
+            longer = f"{line} {word}" if line else word
+            if line and measure(longer) > width:
+                lines.append(line)
+                longer = word
+            line = longer
+        lines += [line] if line else []
+    return lines
 
 
 def show_status(context: bpy.types.Context, words: str | None) -> None:

@@ -1,6 +1,6 @@
 """The window's test says in one line why it cannot be set up, and does not fail for it."""
 
-import importlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 GUI = Path(__file__).with_name("gui")
@@ -82,3 +83,15 @@ def test_debootstrap_is_installed_only_when_asked(
         assert "debootstrap could not be installed (E: no such package)" in line
     else:
         assert not ran and "--install does it" in line
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the module's window is opened on Linux alone")
+def test_the_module_has_what_its_window_needs_and_another_library_is_refused() -> None:
+    """The symbols are looked up in the library of Blender 4.5; one without them ends with a sentence, before anything is changed."""
+    found = importlib.util.find_spec("bpy")
+    places = [Path(place) for place in (found.submodule_search_locations or ())] if found is not None else []
+    cases = [(file, 0, "main_python_enter") for place in places if (place / "4.5").is_dir() for file in place.glob("__init__*.so")]
+    for file, code, words in (*cases, (Path(np.linalg._umath_linalg.__file__), 4, "has no symbol")):
+        script = f"import module_window, pathlib; print(module_window._values(pathlib.Path({str(file)!r})))"
+        done = subprocess.run([sys.executable, "-c", script], cwd=GUI, capture_output=True, text=True, timeout=60)
+        assert done.returncode == code and words in done.stdout, done.stderr

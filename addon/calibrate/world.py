@@ -10,7 +10,7 @@ from ...core.geometry.rig import Rig
 from .. import clicks, project
 from ..scene import axes
 from ..steps.cameras import use_rig
-from ..steps.footage import SimpleOperator
+from ..steps.simple_operator import SimpleOperator
 from .cameras import COLLECTION, EXACT, clip_behind, exact_values, rig_of_scene
 
 TRACKS = {"origin": "World origin", "x": "World X", "y": "World Y"}

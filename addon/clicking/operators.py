@@ -189,9 +189,23 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     only: bpy.props.StringProperty(name="Only", description="Click only this joint. Empty: all joints of the body")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(  # type: ignore[valid-type]
+        name="Frame", default=-1, min=-1, options={"SKIP_SAVE"}, description="In this frame, as a keyframe. −1: the scene's current one"
+    )
     hidden: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Include Hidden Joints", description="Also click chest, spine and collarbones, which are hard to locate from outside"
     )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Begin, in the frame that is asked for."""
+        if self.frame < 0:
+            return super().invoke(context, event)
+        before, first = context.scene.frame_current, context.scene.tricap.seed_frame
+        context.scene.frame_set(self.frame)
+        begun = super().invoke(context, event)
+        context.scene.tricap.seed_frame = first  # so that the surface, which depends on the click frame, need not be measured again
+        context.scene.frame_set(self.frame if begun == {"RUNNING_MODAL"} else before)  # opened views show the click frame
+        return begun
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """The joints of the chosen model."""

@@ -8,6 +8,8 @@ from ..panels import sentence
 from .click_session import joints_of
 from .operators import model_joints
 
+MOST_UNFOLDED = 8  # joints: a longer list is folded until it is opened
+
 
 class ClipPanel:
     """The place of Tricap's panels in the Clip Editor."""
@@ -54,9 +56,14 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         except InputError as error:
             sentence(layout, bpy.context, str(error), "ERROR")
             return
-        grid = layout.column(align=True)
-        for name in names:
-            at = [view for view, clip in clips.items() if clicks.get_click(clip, name, scene.frame_current) is not None]
+        found = {n: [v for v, clip in clips.items() if clicks.get_click(clip, n, scene.frame_current) is not None] for n in names}
+        many = len(names) > MOST_UNFOLDED
+        header, inside = layout.panel(f"tricap_clip_joints_{'many' if many else 'few'}", default_closed=many)
+        header.label(text=f"Joints ({sum(len(at) > 1 for at in found.values())} of {len(names)} clicked)")
+        if inside is None:
+            return
+        grid = inside.column(align=True)
+        for name, at in found.items():
             row = grid.row(align=True)
             row.label(text=f"{name}   {' '.join(at)}", icon="CHECKMARK" if len(at) > 1 else "LAYER_USED" if at else "BLANK1")
             row.operator("tricap.click_joints", text="", icon="EYEDROPPER").only = name

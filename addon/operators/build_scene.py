@@ -169,7 +169,7 @@ def _views(context: bpy.types.Context) -> list[bpy.types.RegionView3D]:
 
 
 def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.types.Object) -> None:
-    """Frame the body in the 3-D views, without the objects of Blender's startup file."""
+    """Frame the body in the 3-D views, without the objects of Blender's startup file, and its frames in the timelines."""
     if context.window is None or bpy.app.background:
         return
     _hide_default_objects(operator, context)
@@ -180,6 +180,10 @@ def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.t
         region = next(r for r in area.regions if r.type == "WINDOW")
         with context.temp_override(area=area, region=region):
             bpy.ops.view3d.view_selected()
+    for area in (a for a in context.window.screen.areas if a.type == "DOPESHEET_EDITOR"):
+        region = next(r for r in area.regions if r.type == "WINDOW")
+        with context.temp_override(area=area, region=region):
+            bpy.ops.action.view_all()
 
 
 def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:

@@ -14,7 +14,7 @@ from .. import folders, project
 from ..jobs import JobOperator
 from ..session import get_session
 from .build_scene import RELATIVE, put_into_scene
-from .stages import StageOperator, report_run
+from .stages import StageOperator, read_if_it_fails, report_run
 
 if TYPE_CHECKING:
     from ...core.run.take_run import Run as TakeRun
@@ -54,8 +54,14 @@ class Run(StageOperator, bpy.types.Operator):
     def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[TakeRun, Contents | None]]":
         """Folders and settings as they are now."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)
-        build = self.build
-        return lambda monitor: measure(take, out, overrides, build, monitor)
+        build, shown = self.build, project.bound(context.scene) and not self.out and not self.take
+        self.so_far = so_far = []
+
+        def compute(monitor: Monitor) -> "tuple[TakeRun, Contents | None]":
+            with read_if_it_fails(out, so_far if shown else [], monitor):
+                return measure(take, out, overrides, build, monitor)
+
+        return compute
 
     def finish(self, context: bpy.types.Context, result: "tuple[TakeRun, Contents | None]") -> set[str]:
         """Build the scene and report the run."""

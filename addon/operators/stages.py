@@ -1,12 +1,14 @@
 """bpy.ops.tricap.measure(take="…", out="…"), bpy.ops.tricap.track(…), bpy.ops.tricap.fit(…)"""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
+from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from .. import project
 from ..jobs import JobOperator
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from ...core.run.take_run import Run
     from ..scene.contents import Contents
 
+TRACKS = "trajectories.npz"  # in a folder of results that has surface and tracks
 STEP_OF_TASK = MappingProxyType({"measure": "surface", "track": "tracks", "fit": "body", "report": "body", "build": "rig"})
 
 
@@ -24,12 +27,24 @@ class StageOperator(JobOperator):
 
     stages: ClassVar[tuple[str, ...]] = ()
     steps = STEP_OF_TASK
+    so_far: Any = ()  # Contents: what was measured before a fit that failed
 
     def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[Run, Contents | None]]":
         """Folders and settings as they are now; writes the project's take.toml."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
         stages, shown = self.stages, project.bound(context.scene) and not self.out  # type: ignore[attr-defined]
-        return lambda monitor: run_and_read(take, out, overrides, stages, shown, monitor)
+        self.so_far = so_far = []
+
+        def compute(monitor: Monitor) -> "tuple[Run, Contents | None]":
+            with read_if_it_fails(out, so_far if shown else [], monitor):
+                return run_and_read(take, out, overrides, stages, shown, monitor)
+
+        return compute
+
+    def after_error(self, context: bpy.types.Context) -> None:
+        """Show what was measured all the same."""
+        for contents in self.so_far:
+            show_so_far(self, context, contents)
 
     def finish(self, context: bpy.types.Context, result: "tuple[Run, Contents | None]") -> set[str]:
         """Show what was measured in the viewport, and report the run."""
@@ -38,6 +53,20 @@ class StageOperator(JobOperator):
             show_so_far(self, context, contents)
         report_run(self, context, run)
         return {"FINISHED"}
+
+
+@contextmanager
+def read_if_it_fails(out: Path, so_far: "list[Contents]", monitor: Monitor) -> Iterator[None]:
+    """Where the body cannot be fitted, add the surface and the tracks in OUT to `so_far`; the error goes on."""
+    try:
+        yield
+    except InputError:
+        from ..scene.contents import read_contents
+
+        if (out / TRACKS).is_file():
+            with suppress(InputError):
+                so_far.append(read_contents(out, monitor))
+        raise
 
 
 def run_and_read(

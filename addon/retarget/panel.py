@@ -9,7 +9,7 @@ import bpy
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.sources import FILES
-from ..panels import sentence
+from ..panels import expanded, sentence
 from . import preview, properties
 
 
@@ -73,7 +73,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             body.use_property_split = True
             for field in dataclasses.fields(settings):
                 body.prop(group, field.name)
-    layout.row().prop(props, "place", expand=True)
+    expanded(layout, props, "place")
     layout.prop(props, "tolerance_deg")
     layout.prop(props, "strip")
     buttons = layout.row(align=True)

@@ -27,6 +27,7 @@ from ...core.take.footage import Footage
 from . import action, armature, cameras, clips, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
+from .looking import look_at
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
 from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser
@@ -98,6 +99,8 @@ def write_scene(
     if contents.bar is not None:
         counts["positions of the bar"] = _add_bar(_part(collection, "Bar"), contents.frames[0], *contents.bar)
     scene.frame_set(scene.frame_start)
+    if bpy.app.background and (armature_object := next(standing.all_bodies(scene), None)) is not None:
+        look_at(armature_object)
     if blend is not None:
         save_blend(Path(blend))
     return SceneReport(collection=collection.name, counts=counts, warnings=tuple(warnings), blend=blend)

@@ -13,7 +13,7 @@ from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..editing import operators as editing
 from ..operators import control_rig
-from ..panels import sentence
+from ..panels import expanded, sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
 from ..scene import footage_plane, layers, metaballs, standing
@@ -173,8 +173,12 @@ def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
 
 
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Fit the body; locked and limited degrees of freedom."""
-    _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
+    """Fit the body, or click the joint that the fit asks for; locked and limited degrees of freedom."""
+    asked = watch.current(context.scene).states["body"].click
+    if asked is not None:
+        button = primary(layout, "tricap.click_joints", True, icon="RESTRICT_SELECT_OFF", text=f"Click {asked[0]} in Frame {asked[1]}")
+        button.only, button.frame = asked
+    _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")
     draw_dofs(layout, context.scene)
@@ -221,7 +225,7 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
 def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Export; retargeting is a section of its own."""
     props = context.scene.tricap_retarget
-    layout.row().prop(props, "export_source", expand=True)
+    expanded(layout, props, "export_source")
     if props.export_source == "PLAYED":
         layout.prop(props, "export")
     button = layout.operator_menu_enum("tricap.export", "kind", text="Export Motion", icon="EXPORT")

@@ -8,6 +8,7 @@ from bpy_extras.io_utils import ImportHelper
 
 from ...core.calibration.rig_files import read_any
 from ...core.calibration.view_names import names_for_views
+from ...core.foundation.errors import InputError
 from ...core.geometry.rig import Rig, renamed, write_rig
 from ...core.take.bar_file import bar_path, read_bar, write_bar
 from ...core.take.footage import open_take
@@ -15,7 +16,9 @@ from .. import folders, project
 from ..calibrate.cameras import rig_of_scene
 from ..operators.build_scene import show_so_far
 from ..scene import clips
-from .footage import SimpleOperator
+from .simple_operator import SimpleOperator
+
+IN_FOLDER = ("rig.toml", "camera_array.toml", "calibration.toml", "Calib.toml")  # Tricap, caliscope, Anipose, Pose2Sim
 
 
 class CamerasFromFile(SimpleOperator, ImportHelper, bpy.types.Operator):
@@ -27,15 +30,9 @@ class CamerasFromFile(SimpleOperator, ImportHelper, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Read it and save a copy as rig.toml in the project."""
-        path = folders.absolute(self.filepath)
-        rig = read_any(path)
-        bar, names = read_bar(path, rig), names_for_views(rig, [view.name for view in context.scene.tricap.views])
-        use_rig(context.scene, renamed(rig, names), bar)
+        said = use_file(context.scene, folders.absolute(self.filepath))
         show_cameras(self, context)
-        matched = "".join(f" Camera {camera} is view {view}." for camera, view in names.items())
-        return (
-            f"{len(rig.cameras)} cameras from {Path(self.filepath).name}.{matched}{' Correct the names if that is wrong.' if names else ''}"
-        )
+        return said
 
 
 class CamerasFromScene(SimpleOperator, bpy.types.Operator):
@@ -50,6 +47,33 @@ class CamerasFromScene(SimpleOperator, bpy.types.Operator):
         rig = rig_of_scene(context.scene)
         use_rig(context.scene, rig)
         return f"{len(rig.cameras)} cameras from the scene."
+
+
+def use_file(scene: bpy.types.Scene, path: Path) -> str:
+    """Make the cameras of a calibration file the project's; a sentence about them.
+
+    Raises:
+        InputError: the file cannot be read, or its cameras are not those of the views.
+    """
+    rig = read_any(path)
+    bar, names = read_bar(path, rig), names_for_views(rig, [view.name for view in scene.tricap.views])
+    use_rig(scene, renamed(rig, names), bar)
+    matched = "".join(f" Camera {camera} is view {view}." for camera, view in names.items())
+    return f"{len(rig.cameras)} cameras from {path.name}.{matched}{' Correct the names if that is wrong.' if names else ''}"
+
+
+def use_calibration_in(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> str:
+    """Use a calibration file that is in the folder of the footage, unless the project has cameras; a sentence about it, or ""."""
+    scene = context.scene
+    file = next((folder / name for name in IN_FOLDER if (folder / name).is_file()), None)
+    if file is None or len(scene.tricap.views) < 2 or (project.existing_folder(scene) / "rig.toml").exists():
+        return ""
+    try:
+        said = use_file(scene, file)
+        show_cameras(operator, context)
+    except InputError as error:
+        return f" {file.name} in that folder is not used: {error}"
+    return f" {said}"
 
 
 def show_cameras(operator: bpy.types.Operator, context: bpy.types.Context) -> None:

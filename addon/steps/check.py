@@ -25,7 +25,7 @@ from ..jobs import JobOperator
 from ..session import get_session
 from . import states, watch
 from .cameras import use_rig
-from .footage import SimpleOperator
+from .simple_operator import SimpleOperator
 
 GOOD = "No problems found."
 OPTION = re.compile(r"--set (\w+)\.(\w+)=([\w.-]*\w)")  # in the advice of a finding

@@ -12,25 +12,17 @@ from ...core.images.sequence import open_sequence
 from ...core.take.footage_files import copy_take, find_footage, find_moved, name_views, take_files
 from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
-from ..panels import TellingOperator, sentence
+from ..panels import sentence
 from . import watch
+from .cameras import use_calibration_in
+from .simple_operator import SimpleOperator
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-class SimpleOperator(TellingOperator):
-    """Mix-in: the steps' states are computed again after the work."""
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do it."""
-        try:
-            return super().execute(context)
-        finally:
-            watch.refresh(context.scene)
-
-
 class AddFootage(SimpleOperator, bpy.types.Operator):
-    """Choose the movies of all cameras at once, the folder that contains a folder of images for each camera, or a take"""
+    """Choose the movies of all cameras at once, the folder that contains a folder of images for each camera, or a take. A calibration
+    in the same folder is used"""
 
     bl_idname = "tricap.add_footage"
     bl_label = "Add Footage"
@@ -77,7 +69,8 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
         fps = self.fps if self.fps != self.offered_fps else 0.0
         if not project.bound(scene) and take_files(place, names):
             return self._add_take(scene, place, fps)
-        return self._add_files(scene, place, names)
+        said = self._add_files(scene, place, names, fps)
+        return f"{said}{use_calibration_in(self, context, place)}"
 
     def _add_take(self, scene: bpy.types.Scene, place: Path, fps: float) -> str:
         """Link the footage of a take; copy its take.toml and cameras."""
@@ -90,8 +83,8 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
         project.write(scene)
         return f"{len(scene.tricap.views)} views, with the settings of {place / 'take.toml'}. Check them in step 1."
 
-    def _add_files(self, scene: bpy.types.Scene, place: Path, names: list[str]) -> str:
-        """Link movies and folders of images."""
+    def _add_files(self, scene: bpy.types.Scene, place: Path, names: list[str], fps: float) -> str:
+        """Link movies and folders of images; `fps`: of images, 0 where the user entered none."""
         sources = find_footage(place, names)
         folder, first = project.make_folder(scene), not project.bound(scene)
         old = [project.view_entry(view) for view in scene.tricap.views]
@@ -105,7 +98,7 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
             unlink_footage(linked)
             raise
         if first:
-            use_rate_of(scene, self.fps)
+            use_rate_of(scene, fps)
             show_frames(scene)
         if lengths_differ(scene, folder):
             use_common_frames(scene, folder)

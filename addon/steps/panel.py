@@ -96,6 +96,8 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         number = STEPS.index(now.next)
         plays = ". Press Space to play the motion." if now.next == STEPS[-1] else ""
         sentence(box, context, f"Next: {number + 1} {TITLES[number]}{plays}", "FORWARD")
+    if now.next == "surface":  # seen before the run: with a body that needs no clicks, step 3 is done and folded
+        box.prop(context.scene.tricap, "model", text="Body")
     if now.next in STAGE:
         box.operator("tricap.run", icon="FF", text="Run Remaining Steps")
 

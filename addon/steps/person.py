@@ -8,7 +8,7 @@ from ...core.foundation.errors import InputError
 from ...core.take.sources import person_files, read_picture
 from ...core.take.writing import link_footage
 from .. import folders, project
-from .footage import SimpleOperator
+from .simple_operator import SimpleOperator
 
 AUTO = "none"
 KINDS = (

@@ -74,6 +74,7 @@ class State:
     status: Status
     message: str = ""
     fix: Fix | None = None
+    click: tuple[str, int] | None = None  # the joint and the frame whose click the fit asks for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +166,9 @@ def _footage(scene: bpy.types.Scene, found: _Project) -> State:
         raise FixableError(str(error), Fix.COMMON_FRAMES) from error
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
     rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} fps"
-    return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.")
+    assumed = not props.is_property_set("fps") and any(view.images for view in take.views)
+    doubt = f" Images have no frame rate; {rate} is assumed. Enter FPS." if assumed else ""
+    return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.{doubt}")
 
 
 def _cameras(scene: bpy.types.Scene, found: _Project) -> State:
@@ -208,7 +211,9 @@ def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
     complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
     if take.body_model in START_ALONE and len(complete) < len(wanted):
         others = f"{len(complete)} of {len(wanted)} joints are clicked, the others are" if complete else "The joints are"
-        return State(status=Status.DONE, message=f"{others} found by the fit, which asks for a click where it is not certain.")
+        part = "Choose another Body if only a part of the person is filmed."
+        message = f"{others} found by the fit, which asks for a click where it is not certain. {part}"
+        return State(status=Status.DONE, message=message)
     if len(complete) < min(NEEDED_JOINTS, len(wanted)):
         return State(status=Status.READY, message=f"Click each joint in at least two views: {len(complete)} of {len(wanted)} so far.")
     missing = [name for name in wanted if name not in complete]

@@ -8,6 +8,7 @@ from typing import Any
 
 import bpy
 
+from ...core.fitting.inputs.start_joints import NeedsClick
 from ...core.foundation.errors import InputError
 from .. import folders, jobs, project
 from ..session import get_session
@@ -24,6 +25,7 @@ class StepEnd:
     key: str
     failed: bool
     message: str
+    click: tuple[str, int] | None = None
 
 
 class OpenSteps(bpy.types.PropertyGroup):
@@ -68,7 +70,7 @@ def _with_ends(scene: bpy.types.Scene, now: StepStates) -> StepStates:
         if name == scene.name_full and step in found:
             same, status = end.key == _input_key(step, now), found[step].status
             if same and status in (Status.READY, Status.STALE):
-                found[step] = State(status=Status.FAILED if end.failed else status, message=end.message)
+                found[step] = State(status=Status.FAILED if end.failed else status, message=end.message, click=end.click)
             elif not same or status == Status.DONE:
                 del ends[name, step]
     return StepStates(states=found, keys=now.keys)
@@ -78,12 +80,13 @@ def _input_key(step: str, now: StepStates) -> str:
     return now.keys.get(states.STAGE.get(step, ""), "")
 
 
-def _job_ended(context: bpy.types.Context, step: str, failed: str, stopped: str) -> None:
+def _job_ended(context: bpy.types.Context, step: str, failed: str, stopped: str, error: BaseException | None = None) -> None:
     scene, ends = context.scene, get_session().file.step_ends
     ends.pop((scene.name_full, step), None)
     now = refresh(scene)
     if (failed or stopped) and step in STEPS:
-        ends[scene.name_full, step] = StepEnd(key=_input_key(step, now), failed=bool(failed), message=failed or stopped)
+        click = (error.joint, error.frame) if isinstance(error, NeedsClick) else None
+        ends[scene.name_full, step] = StepEnd(key=_input_key(step, now), failed=bool(failed), message=failed or stopped, click=click)
         refresh(scene)
 
 

@@ -26,10 +26,11 @@ from ..checking.timing import synchronised
 from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
+from ..fitting.inputs.start_joints import NeedsClick
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence
-from ..fitting.stages.set_up import NeedsClick, NobodyFound, with_start
+from ..fitting.stages.set_up import NobodyFound, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching.foreground import Foreground

@@ -65,7 +65,15 @@ def _fit_input(footage: Footage) -> Any:
     model = NO_BODY if take.no_body else take.body_model
     own = store.digest(*model_files(model)) if model and model.endswith(".toml") else ""
     named = Path(model).name if model and own else model
-    return named, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
+    return (
+        named,
+        own,
+        tuple(sorted(take.locked)),
+        sorted(take.limits.items()),
+        [_clicked(k) for k in take.keyframes],
+        _keypoints(take),
+        ALGORITHM,
+    )
 
 
 STAGE_INPUTS: dict[str, StageInput] = {

@@ -356,7 +356,7 @@ def _frame_clicks(table: Mapping[str, Any], views: tuple[str, ...], where: str) 
     return FrameClicks(
         frame=frame,
         surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
-        joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()},
+        joints={name: _clicks(joints[name], views, f"joint “{name}” of {where}") for name in JOINTS if name in joints},
     )
 
 

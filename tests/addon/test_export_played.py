@@ -12,12 +12,14 @@ from tricap.addon.retarget.playing import exported_rig, played_frames
 from tricap.addon.retarget.write import push_to_strip
 from tricap.core.geometry.rotation import angle_of, transposed
 from tricap.core.motion.formats.bvh import read_bvh
-from tricap.core.motion.formats.markers import read_points_csv
+from tricap.core.motion.formats.c3d import read_c3d, read_segments
+from tricap.core.motion.formats.markers import AXES, read_points_csv
 from tricap.core.motion.formats.ply import read_ply
 from tricap.core.motion.formats.trc import read_trc
 from tricap.core.motion.sources import from_run
 
 from ..core.motion.persons import person, squat
+from ..core.motion.test_studio_files import played_by_opensim
 from .conftest import FPS, SmallRun
 from .test_export_programs import imported
 
@@ -95,15 +97,50 @@ def test_edited_keys_and_layers_are_exported(edited: Any, blender: ModuleType, s
 
 def test_edited_motion_as_bvh_and_points(edited: Any, blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     names, R, head = played(blender, edited)
-    for kind in ("bvh", "csv", "trc"):
+    for kind in ("bvh", "csv", "trc", "c3d"):
         assert blender.ops.tricap.export(kind=kind, filepath=str(tmp_path / f"a.{kind}")) == {"FINISHED"}
     found = read_bvh(tmp_path / "a.bvh", unit_m=1.0, up="Y")
     assert found.rig.names == names and np.abs(found.head_m - head).max() < PLACE_M
     check_same((names, found.R @ transposed(found.R[:1]), found.head_m), (names, R, head))
-    for markers in (read_points_csv(tmp_path / "a.csv"), read_trc(tmp_path / "a.trc")):
+    for markers in (read_points_csv(tmp_path / "a.csv"), read_trc(tmp_path / "a.trc"), read_c3d(tmp_path / "a.c3d")):
         assert markers.names == ("shoulder.R", "elbow.R", "wrist.R")
         assert np.abs(markers.xyz_m[:, :2] - head[:, 1:]).max() < PLACE_M
         assert np.isnan(markers.sigma_m).all(), "an edited motion has no sigmas"
+
+
+def test_edited_motion_as_segments_and_for_opensim(edited: Any, blender: ModuleType, tmp_path: Path) -> None:
+    wanted = played(blender, edited)
+    for kind in ("c3d", "mot"):
+        assert blender.ops.tricap.export(kind=kind, filepath=str(tmp_path / f"a.{kind}")) == {"FINISHED"}
+    found = read_segments(tmp_path / "a.c3d")
+    assert found is not None and found.names == wanted[0]
+    check_same((found.names, found.R @ transposed(found.R[:1]), found.origin_m), wanted)
+    names, R, origin_m = played_by_opensim(tmp_path / "a.osim", tmp_path / "a.mot")
+    assert len(names) == len(wanted[0])
+    back = AXES["OpenSim"].T
+    R = back @ R @ back.T
+    check_same((wanted[0], R @ transposed(R[:1]), origin_m @ back.T), wanted)
+
+
+def test_the_skin_as_alembic_as_it_plays(edited: Any, blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    def shown() -> np.ndarray:
+        graph = blender.context.evaluated_depsgraph_get()
+        skin = max((o for o in blender.data.objects if o.type == "MESH" and o.visible_get()), key=lambda o: len(o.data.vertices))
+        mesh = skin.evaluated_get(graph)
+        return np.array([mesh.matrix_world @ v.co for v in mesh.data.vertices])
+
+    frames = played_frames(blender.context.scene)
+    assert blender.ops.tricap.export(kind="abc", filepath=str(tmp_path / "a.abc")) == {"FINISHED"}
+    wanted = []
+    for hidden in ("Measured", "Cameras", "Lights"):
+        blender.context.view_layer.layer_collection.children["Tricap"].children[hidden].exclude = True
+    for frame in frames:
+        blender.context.scene.frame_set(frame)
+        wanted.append(shown())
+    imported(blender, tmp_path / "a.abc", FPS)
+    for frame, places in zip(frames, wanted):
+        blender.context.scene.frame_set(frame)
+        np.testing.assert_allclose(shown(), places, atol=PLACE_M)
 
 
 def test_the_measured_motion_is_a_choice(edited: Any, blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:

@@ -219,7 +219,7 @@ def test_a_bug_in_the_scene_is_told_too_and_the_panel_hears_of_the_end(
             return {"FINISHED"} if result["nothing"] else {"CANCELLED"}
 
     heard: list[tuple[str, str]] = []
-    listener = lambda context, step, failed, stopped: heard.append((step, failed))  # noqa: E731
+    listener = lambda context, step, failed, stopped, error: heard.append((step, failed))  # noqa: E731
     blender.utils.register_class(BrokenEnd)
     session_of(jobs).on_job_end.append(listener)
     try:

@@ -101,6 +101,17 @@ def test_the_rest_pose_stands_on_the_floor_and_the_root_carries_the_path(empty: 
     assert {bone.color.palette for bone in body.data.bones} == {"THEME01", "THEME04", "THEME09"}
 
 
+def test_the_views_of_a_written_file_look_at_the_person(empty: ModuleType, out: Path, tmp_path: Path) -> None:
+    """The person stands somewhere in the world; a file that the command writes opens with it in view."""
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(out, tmp_path / "body.blend")
+    empty.ops.wm.open_mainfile(filepath=str(tmp_path / "body.blend"))
+    pelvis = empty.data.objects["Body"].matrix_world @ empty.data.objects["Body"].pose.bones["pelvis"].head
+    views = [s.region_3d for screen in empty.data.screens for a in screen.areas for s in a.spaces if s.type == "VIEW_3D"]
+    assert views and all((view.view_location - pelvis).length < 0.3 and 3 < view.view_distance < 6 for view in views)
+
+
 def test_another_floor_leaves_the_motion_in_the_world(empty: ModuleType, out: Path) -> None:
     from tricap.addon.scene import standing
     from tricap.addon.scene.build import build_scene

@@ -56,8 +56,9 @@ def why(states: ModuleType, blender: ModuleType) -> Callable[[str], str]:
 
 
 def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
-    """A saved file with the sample's footage added, as a user would."""
+    """A saved file with the sample's footage added, as a user would; its calibration is in another folder."""
     shutil.copytree(sample, folder / "film")
+    (folder / "film" / "rig.toml").rename(folder / "rig.toml")
     for name in ("take.toml", "truth.npz"):
         (folder / "film" / name).unlink()
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
@@ -87,8 +88,10 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     scene = new_project(blender, sample, tmp_path)
     assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
     assert words() == "done ready done empty empty empty empty empty"
+    assert why("footage").startswith("3 views, 3 frames of 384×288 pixels, 25 fps. Images have no frame rate; 25 fps is assumed.")
+    scene.tricap.fps = 25.0
     assert why("footage") == "3 views, 3 frames of 384×288 pixels, 25 fps."
-    assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
+    assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "rig.toml")) == {"FINISHED"}
     assert "Camera L" in scene.objects and scene.camera.name == "Camera C", "the cameras stand in the viewport"
     scene.tricap.model = "arm.R"
     assert words() == "done done ready ready empty empty empty empty"
@@ -165,6 +168,34 @@ def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, 
     assert words().split()[3:7] == ["done", "done", "done", "stale"]
     assert blender.ops.tricap.run() == {"FINISHED"}
     assert words().split()[3:7] == ["done", "done", "done", "done"]
+
+
+def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
+    blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It leads to the joint in its frame; surface and tracks stand in the viewport meanwhile."""
+    core = NAME.removesuffix("addon") + "core"
+    starts, stages = (importlib.import_module(f"{core}.{name}") for name in ("fitting.inputs.start_joints", "run.pipeline"))
+    watch, panel = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("watch", "panel"))
+    start = starts.StartJoints(frame=2, xyz_m={}, stature=1.0, model="full", probability=0.6, rivals={"front and back": 0.4}, ask="wrist.R")
+
+    def fit(run: Any, monitor: Any) -> None:
+        raise starts.NeedsClick(start)
+
+    shutil.copytree(results, tmp_path / "out")
+    scene = opened(blender, sample, tmp_path)
+    scene.tricap.fitting.gate_m = 0.04
+    monkeypatch.setattr(stages, "fit", fit)
+    for operator in (blender.ops.tricap.fit, blender.ops.tricap.run):
+        with pytest.raises(RuntimeError, match="Click the right wrist in two views of frame 2"):
+            operator()
+        state = watch.current(scene).states["body"]
+        assert words().split()[3:6] == ["done", "done", "failed"] and state.click == ("wrist.R", 2)
+        assert {"Camera L", "Cloud", "Trajectories"} <= set(scene.objects.keys())
+    assert "tricap.click_joints" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
+    assert scene.tricap.seed_frame == 0
+    scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers.insert_frame(3, co=(0.5, 0.5))
+    assert words().split()[3:5] == ["done", "done"] and watch.current(scene).states["body"].click is None
 
 
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
@@ -416,6 +447,7 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
     for n, title in enumerate(states.TITLES, 1):
         assert f"{n}  {title}" in drawn.texts
     assert {"empty": "tricap.open_take", "opened": "tricap.measure", "done": "tricap.export"}[point] in drawn.operators
+    assert point == "empty" or drawn.properties.count("model") == {"opened": 2, "done": 1}[point], "the body is shown before the run"
     if point == "done":
         assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
         assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
@@ -471,6 +503,22 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
         blender.context.view_layer.update()
         watch._tick()
         assert watch.current(scene) is not known
+
+
+def test_a_calibration_in_the_folder_of_the_footage_is_used(
+    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path
+) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    shutil.copytree(sample, tmp_path / "film")
+    (tmp_path / "film" / "take.toml").unlink()
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    assert words().startswith("done done") and blender.context.scene.camera.name == "Camera C"
+    (tmp_path / "film" / "rig.toml").write_text("damaged")
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    assert words().startswith("done ready") and not (tmp_path / "other_tricap" / "rig.toml").exists()
 
 
 def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: Path, tmp_path: Path) -> None:

@@ -340,6 +340,11 @@ def reports() -> list[str]:
         area.type = before
 
 
+def command(*words: str) -> list[str]:
+    """The `tricap` command of this Blender; of the module, which has no program, that of its Python."""
+    return [bpy.app.binary_path, "--command", "tricap", *words] if bpy.app.binary_path else [sys.executable, "-m", "tricap", *words]
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -380,7 +385,7 @@ def run(script: str) -> None:
         sys.stdout.flush()
         os._exit(code)
 
-    bpy.app.timers.register(step, first_interval=1.0)
+    bpy.app.timers.register(step, first_interval=1.0, persistent=True)  # a script may open another file
 
 
 def _with_picture(steps: Steps) -> Steps:

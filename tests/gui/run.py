@@ -24,7 +24,8 @@ def main() -> int:
     began = time.monotonic()
     try:
         root = chroot.set_up(options.root, install=options.install)
-        say(f"{chroot.version(root)} is ready in {root} ({time.monotonic() - began:.0f} s)")
+        program = "the module's Blender" if options.module else chroot.version(root)
+        say(f"{program} is ready in {root} ({time.monotonic() - began:.0f} s)")
         failed = [path.stem for path in options.scripts if not _passed(root, path.resolve(), options)]
     except chroot.Unavailable as why:
         say(f"gui-test: skipped, for {why}.")
@@ -35,7 +36,7 @@ def main() -> int:
 
 def _passed(root: Path, script: Path, options: argparse.Namespace) -> bool:
     began, out = time.monotonic(), options.out / script.stem
-    code = window.run_script(root, options.package, script, out, options.limit, options.data, _size(script))
+    code = window.run_script(root, options.package, script, out, options.limit, options.data, _size(script), module=options.module)
     how = {0: "passed", window.TIMED_OUT: "stopped"}.get(code, f"failed (exit code {code})")
     say(f"== {script.stem}: {how} after {time.monotonic() - began:.0f} s")
     if code:
@@ -56,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "gui", help="folder for pictures and logs")
     parser.add_argument("--data", type=Path, help="a file or folder for the scripts")
     parser.add_argument("--install", action="store_true", help="install debootstrap where it is missing, by the system's package manager")
+    parser.add_argument("--module", action="store_true", help="the window of this Python's module bpy, not that of Debian's Blender")
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for one script, on a machine that does nothing else")
     parser.add_argument("scripts", nargs="*", type=Path, default=[HERE / f"{name}.py" for name in SCRIPTS])
     return parser

@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -12,14 +13,18 @@ from pathlib import Path
 from chroot import SHARE, Unavailable
 
 DRIVER = Path(__file__).with_name("drive.py")
-TIMED_OUT = 124
+MODULE = Path(__file__).with_name("module_window.py")
+TIMED_OUT, OTHER_BUILD = 124, 4  # exit codes; OTHER_BUILD is that of MODULE
 
 
-def run_script(root: Path, package: Path, script: Path, out: Path, limit_s: float, data: Path | None, size: tuple[int, int]) -> int:
+def run_script(
+    root: Path, package: Path, script: Path, out: Path, limit_s: float, data: Path | None, size: tuple[int, int], *, module: bool = False
+) -> int:
     """Install `package` into an empty profile, open Blender's window in the chroot `root`, and let `script` drive it (see drive.py).
 
     What the script writes to its folder `drive.OUT` is in `out` afterwards, with log.txt; `data`, a file or folder, is copied to
     `drive.DATA`. Returns the script's exit code, 0 when all that it checked is so; TIMED_OUT after limit_s, longer on a busy machine.
+    With `module`, the window is that of this Python's module bpy instead; the chroot has the display.
 
     Raises:
         Unavailable: no display can be opened, or the extension cannot be installed.
@@ -33,9 +38,14 @@ def run_script(root: Path, package: Path, script: Path, out: Path, limit_s: floa
         shutil.copyfile(package, folder / "tricap.zip")
         (folder / "out").mkdir()
         with _display(root, inside, size) as display:
-            environment = _environment(inside, display)
-            _install(root, inside, environment)
-            code = _drive(root, inside, script.stem, size, environment, limit_s, folder / "out" / "log.txt")
+            # Each has a cache of its own: two versions of the renderer Mesa that share one end each other (SIGBUS).
+            home, cache = (folder, root / SHARE / "module_cache") if module else (inside, Path("/") / SHARE / "cache")
+            environment = _environment(home, cache, display)
+            _install([sys.executable, MODULE, "--install", home / "tricap.zip"] if module else _installing(root, home), environment)
+            blender = [sys.executable, MODULE] if module else ["chroot", root, "blender"]
+            code = _drive(blender, home, script.stem, size, environment, limit_s, folder / "out" / "log.txt")
+        if module and code == OTHER_BUILD:
+            raise Unavailable((folder / "out" / "log.txt").read_text(errors="replace").strip().rstrip("."))
         out.mkdir(parents=True, exist_ok=True)
         shutil.copytree(folder / "out", out, dirs_exist_ok=True, symlinks=True)  # those into the data lead nowhere outside
         return code
@@ -83,54 +93,45 @@ def _display(root: Path, inside: Path, size: tuple[int, int]) -> Iterator[str]:
         server.wait()
 
 
-def _environment(inside: Path, display: str) -> dict[str, str]:
+def _environment(home: Path, cache: Path, display: str) -> dict[str, str]:
     keep = {name: value for name, value in os.environ.items() if name in ("LANG", "PATH", "TERM")}
     return {
         **keep,
         "DISPLAY": display,
-        "HOME": str(inside),
-        "XDG_CACHE_HOME": f"/{SHARE}/cache",
+        "HOME": str(home),
+        "XDG_CACHE_HOME": str(cache),
         "LIBGL_ALWAYS_SOFTWARE": "1",
-        "BLENDER_USER_RESOURCES": str(inside / "profile"),
+        "BLENDER_USER_RESOURCES": str(home / "profile"),
         "PYTHONUNBUFFERED": "1",
+        "PYTHONFAULTHANDLER": "1",  # the module's Python says where it crashed
         "OPENBLAS_NUM_THREADS": "1",
         "LC_ALL": "C.UTF-8",
     }
 
 
-def _install(root: Path, inside: Path, environment: dict[str, str]) -> None:
-    command = ["chroot", root, "blender", "--command", "extension", "install-file", "-r", "user_default", "-e", inside / "tricap.zip"]
+def _installing(root: Path, inside: Path) -> list[object]:
+    return ["chroot", root, "blender", "--command", "extension", "install-file", "-r", "user_default", "-e", inside / "tricap.zip"]
+
+
+def _install(command: list[object], environment: dict[str, str]) -> None:
     done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, timeout=180)
     if done.returncode:
         raise Unavailable(f"the extension could not be installed: {(done.stdout + done.stderr).strip()}")
 
 
-def _drive(root: Path, inside: Path, script: str, size: tuple[int, int], environment: dict[str, str], limit_s: float, log: Path) -> int:
-    start = f"import sys; sys.path.insert(0, {str(inside)!r}); import drive; drive.run({script!r})"
-    command = [
-        "chroot",
-        root,
-        "blender",
-        "--enable-event-simulate",
-        "--no-window-focus",
-        "--gpu-backend",
-        "opengl",
-        "--window-geometry",
-        0,
-        0,
-        *size,
-        "--python-exit-code",
-        "3",
-        "--python-expr",
-        start,
-    ]
+def _drive(
+    blender: list[object], home: Path, script: str, size: tuple[int, int], environment: dict[str, str], limit_s: float, log: Path
+) -> int:
+    start = f"import sys; sys.path.insert(0, {str(home)!r}); import drive; drive.run({script!r})"
+    options = ["--enable-event-simulate", "--no-window-focus", "--gpu-backend", "opengl", "--window-geometry", 0, 0, *size]
+    command = [*blender, *options, "--python-exit-code", "3", "--python-expr", start]
     with log.open("w") as lines:
-        blender = subprocess.Popen([str(part) for part in command], env=environment, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
+        window = subprocess.Popen([str(part) for part in command], env=environment, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
         try:
-            return _ended(blender, limit_s)
+            return _ended(window, limit_s)
         finally:
-            blender.kill()  # chroot became Blender, so this is Blender
-            blender.wait()
+            window.kill()  # chroot became Blender, so this is Blender
+            window.wait()
 
 
 def _ended(blender: "subprocess.Popen[bytes]", limit_s: float) -> int:

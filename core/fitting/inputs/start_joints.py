@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...foundation.errors import InputError
+
 SIGMA_M = 0.05  # of a joint, in a coordinate
 SIGMAS_M = {"elbow": 0.06, "wrist": 0.11, "knuckles": 0.11}  # of those that one frame hardly shows where an arm lies on the body
 
@@ -36,3 +38,11 @@ class StartJoints:
             f"It is not certain how the person stands in frame {self.frame} ({self.probability:.0%}): {' or '.join(doubts[:2])}. "
             f"Click the {side}{self.ask.partition('.')[0]} in two views of frame {self.frame}, and run it again."
         )
+
+
+class NeedsClick(InputError):
+    """It is not certain how the person stands; the sentence asks for the click that decides: of this joint in this frame."""
+
+    def __init__(self, start: StartJoints) -> None:
+        super().__init__(start.question)
+        self.frame, self.joint = start.frame, start.ask

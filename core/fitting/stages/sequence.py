@@ -32,6 +32,7 @@ from ..context import NO_SHAPE, FitContext
 from ..inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints, thinned
 from ..inputs.fit_input import FitInput
 from ..inputs.material_tracks import MaterialTracks
+from ..inputs.start_joints import NeedsClick
 from ..observations import Observation
 from ..observations.joints import StandingFeet
 from ..segmentation import SegmentationCache
@@ -65,7 +66,7 @@ from .long_sequence import (
     sample,
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
-from .set_up import NeedsClick, fit_context, with_start
+from .set_up import fit_context, with_start
 from .sigma_parts import known, sigma_parts
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
@@ -106,7 +107,7 @@ def fit_sequence(
     motion, observed = track_poses(tracking, monitor, checkpoints)
     motion = follow_limbs(tracking, motion, monitor)
     if given.start is not None and (contradicted := taken_back(fit, given.start, points, motion, first.vector, monitor)):
-        raise NeedsClick(contradicted.question)
+        raise NeedsClick(contradicted)
     settings = replace(settings, model_patch_m=PATCH * settings.model_patch_m)
     fit = replace(fit, silhouettes=fit.silhouettes.drawn_only(), settings=settings)
     whole = Recording(

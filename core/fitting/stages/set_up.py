@@ -17,7 +17,7 @@ from ..inputs.cloud_points import CloudPoints, thinned
 from ..inputs.fit_input import FitInput
 from ..inputs.keypoints import JointTracks
 from ..inputs.silhouettes import Silhouettes
-from ..inputs.start_joints import StartJoints
+from ..inputs.start_joints import NeedsClick, StartJoints
 from ..observations import ClickedJoints, Keypoints, Observation
 from ..observations.self_collision import CollisionPairs
 from ..settings import FitSettings
@@ -33,10 +33,6 @@ WHOLE = "full"  # the model that is looked for, whatever part of it is fitted
 
 class NobodyFound(InputError):
     """There are too few clicks for a start, and no frame in which somebody can be found without them."""
-
-
-class NeedsClick(InputError):
-    """It is not certain how the person stands; the sentence asks for the click that decides."""
 
 
 def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
@@ -97,7 +93,7 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
             f"Click at least {joints} in two views each, under [seeds.joints] or in Blender (step 3)."
         )
     if not certain:
-        raise NeedsClick(start.question)
+        raise NeedsClick(start)
     return replace(given, start=start)
 
 
