@@ -126,7 +126,7 @@ class _End:
         self.template, self.part, self.placed = kind.template(), part, placement(shape, b)
         self._R, self._head, self._left = R, head, self.placed.scale[0] < 0
         rings = self.placed.from_bone((whole.vertices_m[net.rings] - head) @ R)
-        self.row = int(np.flatnonzero((rings.mean(axis=1) @ kind.along <= kind.before) & _beyond_holes(net))[-1])
+        self.row = _row_before(rings.mean(axis=1) @ kind.along, kind.before, _beyond_holes(net))
         ring, local = net.rings[self.row], rings[self.row]
         order = np.arange(len(ring))[::-1] if self._left else np.arange(len(ring))
         spokes = (local - local.mean(axis=0))[order]
@@ -179,6 +179,14 @@ class _End:
         return _Made(vertices, quads, np.concatenate(shares), found)
 
 
+def _row_before(along: np.ndarray, before: float, beyond_holes: np.ndarray) -> int:
+    """The last ring that is `before` a place along the bone and beyond the holes; where an arm is sewn on above that place, the first ring
+    beyond the holes."""
+    usable = np.flatnonzero(beyond_holes)
+    reached = usable[along[usable] <= before]
+    return int(reached[-1] if len(reached) else usable[0])
+
+
 def _beyond_holes(net: Net) -> np.ndarray:
     """The rings (C,) between which and the end of the part no quad is missing."""
     whole = net.kept.all(axis=1)
@@ -194,7 +202,7 @@ def _border_fitted(ring: np.ndarray, template: Template) -> np.ndarray:
     (to, wide), (at, own) = _middle_and_half(ring), _middle_and_half(template.vertices[: template.ring])
     ratio, shift = np.clip(wide / np.maximum(own, 1e-9), *NEAR_RING), to - at
     along = own.argmin()
-    ratio[along], shift[along] = 1.0, 0.0
+    ratio[along], shift[along] = 1.0, max(0.0, shift[along])  # no further back than the ring, where the part ends late
     return np.asarray(template.vertices + (1 - template.own[:, None]) * ((template.vertices - at) * (ratio - 1) + shift))
 
 

@@ -15,6 +15,7 @@ from tricap.core.body.skin import ends
 from tricap.core.body.skin.closed_skin import OneSkin, flipped, one_skin, seam_jumps
 from tricap.core.body.skin.contour_skin import MOST_BONES, body_skin, hinge, strongest
 from tricap.core.body.skin.extremities import person_shape
+from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.mesh import DETAIL, SkinSettings
 from tricap.core.body.skin.whole_surface import WholeSurface
 
@@ -220,3 +221,12 @@ def test_hinges_are_read_from_the_limits() -> None:
     np.testing.assert_allclose(hinge(bones["forearm.R"]), [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(hinge(bones["shin.L"]), [0, 0, 1], atol=1e-12)
     assert not hinge(bones["hand.R"]).any() and not hinge(bones["pelvis"]).any()
+
+
+def test_the_head_of_somebody_with_a_short_neck_is_sewn_on_above_the_shoulders() -> None:
+    """The shoulders reach above the place where the neck usually ends."""
+    whole = default_shape(read_model("full"))
+    lengths = whole.lengths_m.copy()
+    lengths[[bone.name for bone in whole.skeleton.bones].index("neck")] *= 0.7
+    skin = one_skin(shape_for_skin(replace(whole, lengths_m=lengths), SkinSettings()), SkinSettings(), DETAIL)
+    assert not flipped(skin.vertices_m, skin.faces).any()
