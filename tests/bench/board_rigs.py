@@ -51,7 +51,9 @@ def one(seed: int) -> tuple[str, float, float, str]:
     move = back[0].R_cam_world.T @ made[0].R_cam_world, back[0].centre_m
     volume = ((TEST_BARS @ R.T + t) - made[0].centre_m) @ move[0].T + move[1]
     predicted = predicted_error(back, calibration.every_unknown, calibration.considered, volume).rms_m
-    return kind, error_m(cameras, made) / bound, predicted / bound, str(done.verdict.light)
+    seen = np.sum([c.sees(c.project(TEST_BARS)) for c in cameras], axis=0) >= 2
+    points = TEST_BARS[seen.all(axis=1)].reshape(-1, 3)  # those of the bound and of the prediction
+    return kind, error_m(cameras, made, points) / bound, predicted / bound, str(done.verdict.light)
 
 
 def main() -> None:
