@@ -170,19 +170,18 @@ def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("lines", "first"), [("odd", 0), pytest.param("both", 0, marks=pytest.mark.slow), ("both", 1)])
 def test_an_interlaced_bar(tmp_path: Path, lines: str, first: int) -> None:
     """The other field holds another instant: only the field's own rows may be used, of both fields each for its own frame."""
-    positions = 28
-    waved = waved_bar(benchmark_cameras(), positions, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     per = 2 if lines == "both" else 1
     rng, look = np.random.default_rng(0), BarPictures(radius_m=0.02, reflections=1)
     for c, camera in enumerate(waved.cameras):
         (tmp_path / camera.name).mkdir()
-        for n in range(positions // per - 2 + per):
+        for n in range(40 // per - 2 + per):
             frame = picture(waved, per * n + first, c, look, rng)
             frame[1::2] = picture(waved, per * n + 1 - first, c, look, rng)[1::2]
             cv2.imwrite(str(tmp_path / camera.name / f"{n:03d}.png"), frame)
     measured = measure_bar(open_bar(tmp_path, lines, first_field=("odd", "even")[first]), 0.5, Monitor())
     shown = waved.ends_m[: len(measured.observations.frames)]
-    assert len(shown) == (positions if per == 2 else positions - 1)
+    assert len(shown) == (40 if per == 2 else 39)
     true = np.stack([waved.cameras["LCR".index(v)].project(shown) for v in measured.observations.names], axis=1)
     off = np.linalg.norm(measured.observations.xy_px[:, :, :, None] - true[:, :, None], axis=-1).min(axis=-1)
     assert np.nanmedian(off) < 0.05
