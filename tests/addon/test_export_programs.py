@@ -220,10 +220,14 @@ def test_a_folder_that_cannot_be_written_is_told_before_blender_tries(
 ) -> None:
     """Its exporters print a traceback there."""
 
-    def refused(path: Path, *args: object, **more: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+    opened = os.open
 
-    monkeypatch.setattr(Path, "touch", refused)
+    def refused(path: Any, *args: Any, **more: Any) -> int:
+        if str(path).startswith(str(tmp_path / ".a.")):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return opened(path, *args, **more)
+
+    monkeypatch.setattr(os, "open", refused)
     for argv in (["export", "--format", "fbx", "--out", "a.fbx"], ["scene", "--blend", "a.blend"]):
         argv[-1] = str(tmp_path / argv[-1])
         assert main([argv[0], str(small_run.out), *argv[1:], "--quiet"]) == 2
