@@ -92,6 +92,7 @@ def test_the_module_has_what_its_window_needs_and_another_library_is_refused() -
     places = [Path(place) for place in (found.submodule_search_locations or ())] if found is not None else []
     cases = [(file, 0, "main_python_enter") for place in places if (place / "4.5").is_dir() for file in place.glob("__init__*.so")]
     for file, code, words in (*cases, (Path(np.linalg._umath_linalg.__file__), 4, "has no symbol")):
-        script = f"import sys; sys.path.insert(0, {str(GUI)!r}); import module_window, pathlib; print(module_window._values(pathlib.Path({str(file)!r})))"
+        script = f"import pathlib, sys; sys.path.insert(0, {str(GUI)!r}); import module_window as window; "
+        script += f"print(window._values(pathlib.Path({str(file)!r})))"
         done = subprocess.run([sys.executable, "-c", script], cwd=GUI, capture_output=True, text=True, timeout=60)
         assert done.returncode == code and words in done.stdout, done.stderr
