@@ -163,7 +163,7 @@ def _log_odds(r: np.ndarray, noise: float, wide: float) -> np.ndarray:
     narrow = np.exp(-0.5 * (r / noise) ** 2) / (noise * np.sqrt(2 * np.pi))
     empty = (1 - STRAY) * narrow + STRAY * np.exp(-r / (2 * wide)) / (4 * wide)
     covered = (1 - SAME) * np.exp(-r / wide) / (2 * wide) + SAME / 256
-    return np.clip(np.log(covered / np.maximum(empty, np.finfo(float).tiny)), *ODDS).astype(np.float32)
+    return np.clip(np.log(covered) - np.log(np.maximum(empty, np.finfo(np.float32).tiny)), *ODDS).astype(np.float32)
 
 
 def _tightest(ascending: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
