@@ -11,6 +11,7 @@ from typing import Any
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
 from ..core.body.skin.mesh import DETAIL
 from ..core.cli.arguments import check_simplify, standard_output_kept_clean
+from ..core.foundation import bounded
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
 from .retarget import command as retargeting
@@ -125,6 +126,8 @@ def _check(args: argparse.Namespace) -> None:
     check_simplify(args.simplify)
     named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), ("--turntable", args.turntable, ".mp4"))
     for flag, path, ending in named:
+        if path is not None:
+            bounded.check_name(bounded.real_path(path.parent) / path.name)
         if path is not None and path.suffix.lower() != ending:
             raise InputError(f"{flag} {path} is not a {ending} file; choose a name that ends in {ending}.")
 

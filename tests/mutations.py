@@ -4,13 +4,14 @@
 
 A copy is damaged as transfers, disks and strangers do it: cut, with bytes changed, numbers too large or not finite, values of another kind,
 nested too deeply, with endless lines, in another encoding, empty. Never larger than a megabyte. In place of every file there is then
-something that is no file, or far too large: SPECIAL.
+something that is no file, or far too large: SPECIAL; and the sound files are read in folders with the names of FOLDER_NAMES.
 """
 
 import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import struct
@@ -28,13 +29,19 @@ SECONDS, MEGABYTES = 2.0, 500.0
 WAITS_S = 8  # after which a reader is stopped that waits instead of working
 ADDRESSES = 6 << 30  # bytes that the process may have: more would take the machine's memory
 NUMBERS = (b"1e308", b"-1e308", b"nan", b"inf", b"-inf", b"-1", b"0", b"99999999999999999999", b"2147483648", b"4294967295", b"1e-320",
-           b"65536", b"0x10", b"1_0", b"9" * 5000, b"9" * 400, b"0x" + b"f" * 9000, b"1" * 300 + b".0")  # fmt: skip
+           b"65536", b"0x10", b"1_0", b"9" * 5000, b"9" * 400, b"-" + b"9" * 400, b"0x" + b"f" * 10_000, b"0b" + b"1" * 10_000,
+           b"1" * 300 + b".0", b"0." + b"3" * 10_000, b"1e" + b"9" * 400, b"-nan", b"1e309")  # fmt: skip
 KINDS = (b'"text"', b"[]", b"{}", b"[[1, 2], [3]]", b"null", b"true", b"''", b"-", b"1979-05-27", b"[" * 60, b"&a;", b"%n")
 WORDS = (struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<I", 0x10000000), struct.pack("<H", 0xFFFF),
-         struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack(">I", 0x00FFFFFF),
+         struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack("<d", float("nan")),
+         struct.pack("<d", 1e308), struct.pack(">I", 0x00FFFFFF),
          b"\0" * 8, struct.pack("<I", 1 << 24))  # fmt: skip
 NODES: tuple[Any, ...] = (None, True, "", "9" * 5000, "\u00b2", "1e999", -1, 2**80, 1e308, -0.5, [], {}, [[1], 2], {"a": []}, ["x"] * 3000)
 NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ", b"a.", b"{a=", b"data: [", b"JOINT a {", b"[[a.", b'"\\u0041".')
+TOWERS = ((b"[", b"]"), (b'{"a":', b"}"), (b"<a>", b"</a>"), (b"data: [", b"]"), (b"{a=", b"}"), (b"{a: ", b"}"), (b"a.", b""),
+          (b"- ", b""), (b" ", b""), (b"a: ", b""), (b"? ", b""), (b"&a [", b"]"), (b"!!a ", b""), (b"(", b")"),
+          (b"JOINT a\n{\nOFFSET 0 1 0\n", b"}\n"), (b"<!-- ", b" -->"), (b"\n[a]\n[a.a]\n", b""), (b"[[a]]\n", b""))  # fmt: skip
+FOLDER_NAMES = (os.fsdecode(b"not \xff utf-8"), "two\nlines", "\u00e9 \u4eba \U0001f600", "%n%s $(x) ;`x`", "-o", "=1+1", "x" * 200)
 SPARSE_BYTES = 20_000_000_000
 
 
@@ -140,6 +147,35 @@ def _insert(data: bytes, r: random.Random) -> bytes:
     return data[:i] + what + data[i:]
 
 
+def _deep(data: bytes, r: random.Random) -> bytes:
+    """Brackets, keys or elements inside of each other: a file of its own, a line, or a value; often they are closed again."""
+    opening, closing = r.choice(TOWERS)
+    floors = r.choice((3_000, 20_000))
+    tower = opening * floors + r.choice((b"", b"1", b"a = 1\n", b"1" + closing * floors, b"]\na = 1\n"))
+    places = [m.end() for m in re.finditer(rb"[=:,>\n\[] ?", data[:200_000])]
+    i = r.choice((0, len(data), *r.sample(places, min(len(places), 4))))
+    return data[:i] + r.choice((b"", b"", b"[", b"x = ")) + tower + r.choice((b"", data[i:], b"\n" + data[i:]))
+
+
+def _indented(data: bytes, r: random.Random) -> bytes:
+    """Each line a step deeper than the one before, as YAML nests."""
+    key, i = r.choice((b"a:", b"-", b"a: &b", b"- a:")), r.choice((0, _place(data, r)))
+    return data[:i] + b"\n" + b"".join(b" " * k + key + b"\n" for k in range(r.choice((100, 1300)))) + data[i:]
+
+
+def _encoded(data: bytes, r: random.Random) -> bytes:
+    """Text in another encoding, with or without the mark at its beginning; or in a word of it, what is not text in UTF-8."""
+    if r.random() < 0.5:
+        kind = r.choice(("utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "utf-7", "cp037"))
+        return data.decode("latin-1").encode(kind, errors="replace")
+    words = list(re.finditer(rb"[A-Za-z_]{2,}", data[:200_000]))
+    i = r.choice(words).start() + 1 if words else _place(data, r)
+    what = r.choice(
+        (b"\xe9", b"\0", b"\xc0\x80", b"\xed\xa0\x80", b"\xf4\x90\x80\x80", "\u202e".encode(), "\ufeff".encode(), b"\x1b[2J", b"\x85")
+    )
+    return data[:i] + what + data[i:]
+
+
 def _nothing(data: bytes, r: random.Random) -> bytes:
     return r.choice((b"", b"\n", b"\0" * 100, b"\xef\xbb\xbf" + data, data.decode("latin-1").encode("utf-16")))
 
@@ -156,8 +192,8 @@ def _sound_sums(data: bytes, r: random.Random) -> bytes:
 
 
 DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _node, _node, _all_different, _insert, _nothing,
-    _sound_sums)  # fmt: skip
+    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _node, _node, _all_different, _insert, _deep, _deep,
+    _indented, _encoded, _nothing, _sound_sums)  # fmt: skip
 
 
 def memory_mb() -> tuple[float, float]:
@@ -247,15 +283,16 @@ def tried(read: Callable[[Path], Any], folder: Path) -> tuple[bool, str, float, 
 
 
 def attack(name: str, folder: Path, count: int) -> dict[str, Any]:
-    """Damage a reader's files `count` times, then put each of SPECIAL in place of each; what came of it. The faults carry the damaged
-    file's number, or what was in its place."""
+    """Damage a reader's files `count` times, put each of SPECIAL in place of each, and read them in a folder with each of FOLDER_NAMES;
+    what came of it. The faults carry the damaged file's number, what was in its place, or the name."""
     from readers import FAULTY, READERS
 
     make, read = (READERS | FAULTY)[name]
     files = make(folder)
     whole = {path: path.read_bytes() for path in files}
     read(folder)
-    said = {"reader": name, "read": 0, "refused": 0, "special": 0, "slowest_s": 0.0, "most_mb": 0.0, "faults": []}
+    there = sorted(folder.rglob("*"))
+    said = {"reader": name, "read": 0, "refused": 0, "special": 0, "names": 0, "slowest_s": 0.0, "most_mb": 0.0, "faults": []}
     for number in range(count):
         r = random.Random(f"{name} {number}")
         target = r.choice(files)
@@ -277,6 +314,14 @@ def attack(name: str, folder: Path, count: int) -> dict[str, Any]:
             said["faults"].append({"number": what, "file": target.name, "fault": fault})
         target.rmdir() if target.is_dir() and not target.is_symlink() else target.unlink(missing_ok=True)
         target.write_bytes(whole[target])
+    for other in FOLDER_NAMES if name in READERS and sys.platform == "linux" else ():
+        _, fault, _, _ = tried(read, Path(shutil.copytree(folder, folder / other, ignore=shutil.ignore_patterns(other))))
+        shutil.rmtree(folder / other)
+        said["names"] += 1
+        if fault:
+            said["faults"].append({"number": ascii(other), "file": "", "fault": fault})
+    if sorted(folder.rglob("*")) != there:
+        said["faults"].append({"number": "all", "file": "", "fault": "files were made or removed by who only reads"})
     return said
 
 

@@ -44,7 +44,9 @@ def test_only_input_errors_come_out_of_damaged_files(tmp_path: Path) -> None:
     assert not died, f"the process died in “{died}”"
     faults = [(row["reader"], fault) for row in said for fault in row["faults"]]
     assert not faults, "\n".join(f"{name}, number {f['number']}: {f['fault']}" for name, f in faults)
-    assert len(said) > 35 and all(row["read"] + row["refused"] == COUNT and row["special"] for row in said)
+    assert len(said) > 35 and all(
+        row["read"] + row["refused"] == COUNT and row["special"] and (row["names"] or sys.platform != "linux") for row in said
+    )
     assert sum(row["refused"] for row in said) > 0.4 * COUNT * len(said)  # the damage is real
 
 

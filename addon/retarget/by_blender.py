@@ -19,7 +19,7 @@ from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
-from ...core.foundation.bounded import real_path
+from ...core.foundation.bounded import check_name, real_path
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
@@ -114,9 +114,10 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     """Let an exporter write to a temporary file next to `file` and rename it, so that `file` is complete or unchanged.
 
     Raises:
-        InputError: the exporter failed.
+        InputError: the exporter failed, or Blender cannot be given that name.
     """
     file = real_path(file)
+    check_name(file)
     part = store.part_of(file)
     try:
         store.try_writing(part)

@@ -70,7 +70,8 @@ def _size(count: int) -> str:
 
 
 def check_name(path: Path) -> None:
-    """Check that the name of a folder can be written into files and reports: on some systems names are any bytes.
+    """Check that a name can be written into files and reports, and given to other libraries: on some systems names are any bytes, and
+    OpenCV and Blender crash, or raise, where they are no text.
 
     Raises:
         InputError: it is no Unicode text.
@@ -78,7 +79,7 @@ def check_name(path: Path) -> None:
     try:
         str(path).encode()
     except UnicodeEncodeError as error:
-        raise InputError(f"The name of the folder {_shown(path)} is not UTF-8; rename it, or one of those above it.") from error
+        raise InputError(f"The name of {_shown(path)} is not UTF-8; rename it, or a folder above it.") from error
 
 
 def _shown(path: Path) -> str:

@@ -345,6 +345,7 @@ def _check_movie(path: Path) -> None:
     """Only files with their own images are decoded: playlists and scripts would make the decoder open other files, even URLs."""
     if path.suffix.lower() not in MOVIE_ENDINGS:
         raise InputError(f"The movie {path} is of an unsupported kind ({', '.join(MOVIE_ENDINGS)}); convert it to H.264 in .mp4.")
+    bounded.check_name(path)
     first = _first_bytes(path, "movie")
     if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES):
         raise InputError(NO_MOVIE.format(path=path))

@@ -138,3 +138,11 @@ def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_ru
     with pytest.raises(InputError, match="Cannot write"):
         export_file(small_run.out, "glb", wave_file / "a.glb", "plain", Monitor())
     assert not list(tmp_path.glob(".*part*"))
+
+
+def test_a_file_whose_name_is_no_text_is_not_given_to_blender(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.retarget.by_blender import write_whole
+
+    with pytest.raises(InputError, match="is not UTF-8; rename it"):
+        write_whole(tmp_path / "a\udcff.fbx", lambda part: pytest.fail("the exporter was called"))
+    assert not list(tmp_path.iterdir())

@@ -179,7 +179,7 @@ def test_a_name_that_is_no_unicode_is_refused_before_anything_is_measured(tmp_pa
         with pytest.raises(InputError, match=r"k.udcff is not UTF-8; rename it"):
             read(folder)
     (folder / "below").mkdir()
-    with pytest.raises(InputError, match="one of those above it"):
+    with pytest.raises(InputError, match="a folder above it"):
         read_take(folder / "below")
 
 

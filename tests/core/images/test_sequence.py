@@ -203,6 +203,13 @@ def test_movies_that_are_none(tmp_path: Path) -> None:
             open_sequence(tmp_path, images=None, movie=name, view="L")
 
 
+def test_a_movie_with_a_name_that_is_no_text(tmp_path: Path) -> None:
+    """OpenCV crashes on such a name."""
+    for path in (tmp_path / "k\udcff" / "c.avi", tmp_path / "k\udcff.mp4"):
+        with pytest.raises(InputError, match="is not UTF-8; rename it"):
+            Movie(path)
+
+
 def test_a_playlist_is_no_movie(tmp_path: Path) -> None:
     """A decoder would follow it out of the take, even into the network; whatever its name, it is not given to the decoder."""
     write_movie(tmp_path / "elsewhere.avi", 4)
