@@ -19,7 +19,7 @@ from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
-from ...core.foundation.bounded import real_path
+from ...core.foundation.bounded import real_place
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
@@ -116,7 +116,7 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     Raises:
         InputError: the exporter failed.
     """
-    file = real_path(file)
+    file = real_place(file)
     part = store.part_of(file)
     try:
         store.try_writing(part)
