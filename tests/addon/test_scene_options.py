@@ -157,12 +157,13 @@ def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: 
     """Blender keeps a picture of that name, which may be another person's, and follows a link of the folder's name."""
     from tricap.addon.retarget.export import export_file
 
-    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out, elsewhere = tmp_path / "usd", tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "mine.png").write_text("mine")
     (out / "textures").mkdir(parents=True)
-    shape = shape_for_skin(small_run.shape, SkinSettings())
-    write_skin(small_run.out / "skin" / REST, rest_skin(shape, SkinSettings()))
+    made = rest_skin(shape_for_skin(small_run.shape, SkinSettings()), SkinSettings())
+    v = len(made.vertices_m)
+    write_skin(small_run.out / "skin" / REST, replace(made, relief_m=np.zeros(v), sigma_m=np.full(v, 0.003)))
     assert cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), 99, np.uint8))
     (out / "textures" / "texture.png").symlink_to(elsewhere / "mine.png")
     export_file(small_run.out, "usd", out / "a.usd", "plain", Monitor())
