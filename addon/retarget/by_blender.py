@@ -8,6 +8,7 @@ is always in metres. Axes: FBX and USD use those of the program, glTF and Alembi
 
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,10 +20,11 @@ from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
-from ...core.foundation.bounded import check_name, real_path
+from ...core.foundation.bounded import check_name, real_place
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
+from ...core.results.folder import check_inside
 from ..scene import skin
 from . import playing, programs
 from .build import build_armature
@@ -116,7 +118,7 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     Raises:
         InputError: the exporter failed, or Blender cannot be given that name.
     """
-    file = real_path(file)
+    file = real_place(file)
     check_name(file)
     part = store.part_of(file)
     try:
@@ -178,17 +180,25 @@ def _glb(path: str, program: Program) -> None:
 def _usd(path: str, program: Program) -> None:
     axes = program.axes or "Z up"
     unit = {"cm": "CENTIMETERS"}.get(program.unit, "METERS")
-    bpy.ops.wm.usd_export(
-        filepath=path,
-        export_animation=True,
-        export_armatures=True,
-        export_meshes=True,
-        only_deform_bones=False,
-        convert_orientation=axes != "Z up",
-        export_global_forward_selection=FORWARD[axes].replace("-", "NEGATIVE_"),
-        export_global_up_selection=UP[axes],
-        convert_scene_units=unit,
-    )
+    textures = Path(path).parent / "textures"
+    check_inside(textures, textures.parent)
+    with tempfile.TemporaryDirectory(prefix=".", suffix=".part", dir=textures.parent) as folder:  # Blender keeps or follows what is there
+        file = Path(folder) / Path(path).name
+        bpy.ops.wm.usd_export(
+            filepath=str(file),
+            export_animation=True,
+            export_armatures=True,
+            export_meshes=True,
+            only_deform_bones=False,
+            convert_orientation=axes != "Z up",
+            export_global_forward_selection=FORWARD[axes].replace("-", "NEGATIVE_"),
+            export_global_up_selection=UP[axes],
+            convert_scene_units=unit,
+        )
+        for picture in (Path(folder) / textures.name).glob("*"):
+            textures.mkdir(exist_ok=True)
+            os.replace(picture, textures / picture.name)
+        os.replace(file, path)
 
 
 def _abc(path: str, program: Program) -> None:

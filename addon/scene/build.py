@@ -17,7 +17,7 @@ from mathutils import Matrix
 from ...core.body.fields import potential_named
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
-from ...core.foundation.bounded import real_path
+from ...core.foundation.bounded import real_path, real_place
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
@@ -79,7 +79,7 @@ def write_scene(
     collection[OUT_KEY] = str(contents.out)
     collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
     if blend is not None:
-        collection[PLACES_KEY] = _places(contents, real_path(blend).parent)
+        collection[PLACES_KEY] = _places(contents, real_place(blend).parent)
     scene.collection.children.link(collection)
     set_time(scene, contents)
     counts: dict[str, int] = {}
@@ -202,7 +202,7 @@ def save_blend(path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    path = real_path(path)
+    path = real_place(path)
     if path.suffix != ".blend":
         raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
     part = store.part_of(path)
@@ -396,7 +396,7 @@ def _add_body(
         if stand is not None:
             skin_object.data.transform(Matrix.Translation((0.0, 0.0, stand.lift_m)))
         if contents.skins is not None and blend is not None:
-            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, real_path(blend).with_suffix(".pc2"))
+            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, real_place(blend).with_suffix(".pc2"))
             counts["exact skin faces"] = len(shown.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")

@@ -91,6 +91,11 @@ def real_path(path: str | Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def real_place(path: str | Path) -> Path:
+    """The absolute path; only a link of this very name stays one, so that a file which is written there replaces it and not its end."""
+    return real_path(Path(path).parent) / Path(path).name
+
+
 def check_file(path: Path, largest: int) -> None:
     """Check a file that another library opens by its name.
 

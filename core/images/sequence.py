@@ -297,13 +297,13 @@ def decoded(path: Path) -> np.ndarray:
         InputError: the file is missing, is not an image, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type of pixels.
     """
     try:
-        data = np.frombuffer(bounded.bytes_of(path, bounded.IMAGE_BYTES), dtype=np.uint8)
+        content = bounded.bytes_of(path, bounded.IMAGE_BYTES)
     except OSError as error:
         raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
-    _refuse_open_exr(data[:8].tobytes(), path)
-    _refuse_size(claimed_size(data.tobytes()), path)
+    _refuse_open_exr(content[:8], path)
+    _refuse_size(claimed_size(content), path)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:

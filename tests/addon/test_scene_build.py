@@ -211,6 +211,23 @@ def test_saving_does_not_follow_links_that_a_stranger_made_for_it(empty: ModuleT
     assert (out / "x.blend").stat().st_size > 1000 and letter.read_text() == "mine" and not (tmp_path / "not there").exists()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_what_blender_writes_replaces_a_link_of_its_name(empty: ModuleType, tmp_path: Path) -> None:
+    """As what we write: a folder from somebody else may have links under the names of its files."""
+    from tricap.addon.retarget.by_blender import write_whole
+    from tricap.addon.scene.build import save_blend
+
+    out, letters = tmp_path / "out", tmp_path / "letters"
+    out.mkdir(), letters.mkdir()
+    for name in ("x.blend", "x.fbx"):
+        (letters / name).write_text("mine")
+        (out / name).symlink_to(letters / name)
+    save_blend(out / "x.blend")
+    write_whole(out / "x.fbx", lambda part: Path(part).write_text("motion"))
+    assert {path.name: path.read_text() for path in letters.iterdir()} == {"x.blend": "mine", "x.fbx": "mine"}
+    assert not (out / "x.blend").is_symlink() and (out / "x.fbx").read_text() == "motion" and not (out / "x.fbx").is_symlink()
+
+
 def test_the_operator_builds_saves_and_keeps_the_open_file(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert blender.ops.tricap.build_scene(out=str(small_run.out), blend=str(tmp_path / "copy.blend")) == {"FINISHED"}

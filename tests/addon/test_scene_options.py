@@ -152,6 +152,30 @@ def test_the_texture_is_packed_and_exported(empty: ModuleType, small_run: SmallR
     assert any("no readable image" in w for w in build_scene(small_run.out).warnings)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    """Blender keeps a picture of that name, which may be another person's, and follows a link of the folder's name."""
+    from tricap.addon.retarget.export import export_file
+
+    out, elsewhere = tmp_path / "usd", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "mine.png").write_text("mine")
+    (out / "textures").mkdir(parents=True)
+    made = rest_skin(shape_for_skin(small_run.shape, SkinSettings()), SkinSettings())
+    v = len(made.vertices_m)
+    write_skin(small_run.out / "skin" / REST, replace(made, relief_m=np.zeros(v), sigma_m=np.full(v, 0.003)))
+    assert cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), 99, np.uint8))
+    (out / "textures" / "texture.png").symlink_to(elsewhere / "mine.png")
+    export_file(small_run.out, "usd", out / "a.usd", "plain", Monitor())
+    assert (out / "textures" / "texture.png").read_bytes().startswith(b"\x89PNG") and (elsewhere / "mine.png").read_text() == "mine"
+    assert sorted(path.name for path in out.iterdir()) == ["a.usd", "textures"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "textures").symlink_to(elsewhere)
+    with pytest.raises(InputError, match="textures is a link to a place outside"):
+        export_file(small_run.out, "usd", tmp_path / "other" / "a.usd", "plain", Monitor())
+    assert [path.name for path in elsewhere.iterdir()] == ["mine.png"]
+
+
 def test_one_skin_is_shown_and_metaballs_are_excluded_behind_it(empty: ModuleType, small_run: SmallRun) -> None:
     from tricap.addon.scene import metaballs
     from tricap.addon.scene.build import build_scene

@@ -21,6 +21,7 @@ FITS = 0.9  # fraction of a preset's bones that a rig must have for the preset t
 LIMB_ROLES = 8  # a rig with whole limbs but at most so many parts is a limb or half a body, not an unrecognised person
 HEAD_OFF_AXIS = 0.02  # by the rig's height: the bones of neck and head are not farther from the chest's vertical
 MOST_DEG = 360.0  # of a rotation offset
+MOST_NAMES, LONGEST_NAME = 100, 255  # of a part or of the prefixes, in a mapping
 MOST_ON_NECK = 3  # a bone with more children is not part of a neck
 NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
 
@@ -102,13 +103,21 @@ def read_preset(path: Path) -> Preset:
         raise InputError(f"{path} is no mapping of bones; it needs a table “bones” with a name or list of names by role.")
     sides = table.get("sides", {"L": "L", "R": "R"})
     prefixes = table.get("prefixes", [""])
-    if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
-        raise InputError(f'{path} has invalid “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
+    spelt = isinstance(sides, dict) and set(sides) == {"L", "R"} and _are_names([*sides.values()])
+    if not spelt or not _are_names(prefixes):
+        raise InputError(
+            f'{path} has invalid “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of at most {MOST_NAMES} short texts.'
+        )
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
     control_rig = control_rig_of(table["steering"], sides, path) if "steering" in table else None
     offsets = _offsets(table.get("offsets_deg", {}), path)
     name = str(table.get("name", Path(path).stem))
     return Preset(name=name, prefixes=tuple(prefixes), control_rig=control_rig, offsets_deg=offsets, **parts)
+
+
+def _are_names(value: Any) -> bool:
+    """Whether this is a list of names of a length that bones have: every prefix is tried with every name, and sides are put into them."""
+    return isinstance(value, list) and 0 < len(value) <= MOST_NAMES and all(isinstance(x, str) and len(x) <= LONGEST_NAME for x in value)
 
 
 def _offsets(table: Any, path: Path) -> dict[str, tuple[float, float, float]]:
@@ -158,8 +167,8 @@ def _by_role(table: Any, sides: Map[str, str], key: str, path: Path) -> dict[str
     rows: dict[str, tuple[str, ...]] = {}
     for role, names in table.items() if isinstance(table, dict) else ():
         chain = [names] if isinstance(names, str) else names
-        if not isinstance(chain, list) or not chain or not all(isinstance(name, str) for name in chain):
-            raise InputError(f"{path} names no bones for “{role}” in “{key}”; write a name or a list of names.")
+        if not _are_names(chain):
+            raise InputError(f"{path} names no bones for “{role[:40]}” in “{key}”; write a name or a list of at most {MOST_NAMES} names.")
         for side, written in sides.items() if role.endswith("{s}") else (("", ""),):
             rows[role.replace("{s}", side)] = tuple(name.replace("{s}", written) for name in chain)
     for role in rows:

@@ -1,5 +1,6 @@
 """Reading footage: every kind of image, movies, natural order, gaps, and files that are not what they say."""
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.images import sequence
-from tricap.core.images.sequence import ImageFiles, Movie, grey, open_sequence, read_image
+from tricap.core.images.sequence import ImageFiles, Movie, decoded, grey, open_sequence, read_image
 
 RAMP = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 21
 
@@ -328,3 +329,16 @@ def test_links_and_placeholders_of_images_that_are_elsewhere(tmp_path: Path) -> 
     (tmp_path / "L" / "3.png").symlink_to(tmp_path / "drive" / "3.png")
     with pytest.raises(InputError, match="a link that leads to .* is its drive connected"):
         open_sequence(tmp_path, images="L/*.png", movie=None, view="L")
+
+
+def test_a_file_that_is_no_image_is_in_memory_once(tmp_path: Path) -> None:
+    """A sparse file of 400 MB, which is a kilobyte in an archive, took 0.9 GB."""
+    with (tmp_path / "a.png").open("wb") as file:
+        file.truncate(32 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="not a readable image"):
+            decoded(tmp_path / "a.png")
+        assert tracemalloc.get_traced_memory()[1] < 1.5 * (32 << 20)
+    finally:
+        tracemalloc.stop()

@@ -1,5 +1,6 @@
 """Recognition of rigs by names, by shape, and by presets."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -202,6 +203,12 @@ def test_bones_that_mark_an_end_are_no_parts() -> None:
         ('{"bones": {"elbow": "x"}}', "no part of the body"),
         ('{"bones": {"hips": 3}}', "no bones"),
         ('{"bones": {}, "sides": {"L": 1}}', "sides"),
+        ('{"bones": {}, "prefixes": 5}', "prefixes"),
+        ('{"bones": {}, "prefixes": null}', "prefixes"),
+        ('{"bones": {}, "prefixes": []}', "prefixes"),
+        (json.dumps({"bones": {"hips": ["{s}"] * 8000}}), "no bones"),  # tried with every prefix: 17 s
+        (json.dumps({"bones": {}, "prefixes": [""] * 60000}), "prefixes"),
+        (json.dumps({"bones": {"hand.{s}": "{s}" * 100}, "sides": {"L": "x" * 300000, "R": "y"}}), "sides"),  # 30 MB for a name
         ('{"bones": {"hips": "nowhere"}}', "None of the bones"),
     ],
 )
