@@ -1,6 +1,9 @@
 """One pass over the reduced footage: how much moves in each frame, how bright it is, and which frames repeat."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -110,6 +113,41 @@ def rate_findings(footage: Footage) -> list[Finding]:
             advice = "Give the view the `timestamps` of its images in take.toml, or convert the movie to a constant frame rate."
             findings.append(wrong(Cause.VARIABLE_FRAME_RATE, sentence, advice, uneven_frames=uneven))
     return findings
+
+
+def gap_findings(footage: Footage) -> list[Finding]:
+    """Views of numbered images whose numbers advance further than those of the others: images are missing between them."""
+    numbers = {
+        view.name: found
+        for k, (view, sequence) in enumerate(zip(footage.take.views, footage.sequences))
+        if not footage.clocks and (found := _numbers(sequence.files(), [footage.number(k, frame) for frame in footage.frames]))
+    }
+    if len(numbers) < 2:
+        return []
+    table = np.array([*numbers.values()])
+    advanced = table - table[:, :1]
+    ahead, findings = advanced > advanced.min(axis=0), []
+    for name, row, missing in zip(numbers, table, ahead):
+        if missing.any():
+            i = int(np.argmax(missing))
+            findings.append(
+                wrong(
+                    Cause.FRAMES_MISSING,
+                    f"View {name} seems to lack images before its image {row[i]}: from frame {footage.frames[i]} on it shows later moments "
+                    "than the other views.",
+                    "Put the missing images back, or leave these frames out with `frames` in take.toml.",
+                    first=footage.frames[i],
+                )
+            )
+    return findings
+
+
+def _numbers(files: Sequence[Path], rows: Sequence[int]) -> list[int]:
+    """The last number in the names of some of the files; none where a name has no number, or one file holds all images."""
+    if len(files) < 2:
+        return []
+    found = [re.findall(r"\d+", files[row].stem) for row in rows]
+    return [int(digits[-1]) for digits in found] if all(found) else []
 
 
 def _blank(figures: Survey, name: str, blank: np.ndarray) -> Finding:

@@ -43,7 +43,7 @@ from .rig_check import (
     unit_findings,
     wide_findings,
 )
-from .survey import frozen_view, picture_findings, rate_findings, survey
+from .survey import frozen_view, gap_findings, picture_findings, rate_findings, survey
 from .timing import Film, TimeOffset, estimate_offsets
 from .view_matches import eight_bits, match_views
 
@@ -249,7 +249,13 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     film = Film(footage, survey(footage, monitor))
     fitting = from_table(FitSettings, footage.take.settings.get("fitting", {}), "[fitting]")
     wide = wide_findings(footage.rig.cameras, footage.take.reference) if fitting.use_surface else []
-    findings = [*geometry_findings(footage.rig), *wide, *picture_findings(film.survey, names), *rate_findings(footage)]
+    findings = [
+        *geometry_findings(footage.rig),
+        *wide,
+        *picture_findings(film.survey, names),
+        *rate_findings(footage),
+        *gap_findings(footage),
+    ]
     pairs = film.matches()
     identical = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)

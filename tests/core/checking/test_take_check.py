@@ -165,6 +165,16 @@ def image_gone(take: Path) -> None:
     pictures(take, "C")[5].unlink()
 
 
+def image_gone_near_the_end(take: Path) -> None:
+    """Each view has as many images as the take asks for, and too few for a gap to stand out by itself."""
+    for view in "LCR":
+        for path in pictures(take, view)[3:]:
+            path.unlink()
+    pictures(take, "L")[1].unlink()
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(text.replace("fps", "frames = [0, 2]\nfps"))
+
+
 def other_size(take: Path) -> None:
     for path in pictures(take, "L"):
         change(path, lambda p: p[:-8])
@@ -177,6 +187,7 @@ FAULTS = {
     smooth_sleeve: "weak texture", dark: "dark", overexposed: "overexposed", repeated: "repeated frames", frozen: "frozen view",
     a_frame_late: "out of step", nobody_clicked: "no clicks", one_joint_clicked: "few clicks",
     seed_on_the_wall: "seed on the background", contradicting_click: "clicks", image_gone: "input", other_size: "input",
+    image_gone_near_the_end: "frames missing",
 }  # fmt: skip
 
 
