@@ -289,6 +289,9 @@ def test_the_views_share_the_largest_area(blender: ModuleType, scene: Any) -> No
 
 def test_body_and_footage_share_the_largest_area(blender: ModuleType, scene: Any) -> None:
     window = blender.context.window_manager.windows[0]
+    for area in window.screen.areas:  # other tests open the views
+        if area.type == "CLIP_EDITOR":
+            area.type = "TEXT_EDITOR"
     review, clip = module("correcting.review"), module("project").clips_of(scene)["C"]
     assert not blender.ops.tricap.review.poll(), "there is no body"
     assert list(review.lay_out(window, clip.name)) == ["split", "shown"]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -27,7 +28,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def shell(line: str, rig: Path, **environment: str) -> subprocess.CompletedProcess[bytes]:
     """`tricap ARGUMENTS` in the line is the command."""
-    script = line.replace("tricap", f"{sys.executable} -P -m tricap").replace("RIG", str(rig))
+    script = line.replace("tricap", f"{shlex.quote(sys.executable)} -P -m tricap").replace("RIG", str(rig))
     return subprocess.run(["bash", "-c", script], capture_output=True, env={**os.environ, **environment}, timeout=120)
 
 
