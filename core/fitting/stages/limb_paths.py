@@ -3,11 +3,12 @@
     cost_k(t) = min_j [cost_j(t − 1) + min(|X_k − X̂_j|² / 2σ², LARGEST_JUMP)] − gain_k / GAIN                 (1)
 
 k are poses of the limb in frame t: those of the ways so far, kept and continued, others near them, and poses all over the joints' range
-(Halton 1960), improved where they explain most (`explained.limb_gains`). X are the ends of the limb's bones, X̂_j those predicted from way j
-with damped velocity, σ grows with the time between the frames. The best `WAYS` poses that differ go on (beam search; Viterbi 1967). The
-trunk stays as it was tracked: it is large and hardly ever lost. What is seen of a limb later thus decides where it went before, and where
-nothing is seen of it, it moves evenly. A limb is followed from the frame where the fit begins, and stays there as it was found; one that is
-not certain there (`FitContext.unsure`) is followed from the first frame to the last, and may begin anywhere.
+(Halton 1960), improved where they explain most (`explained.limb_gains`). X are the ends of the limb's bones, X̂_j those predicted from way
+j with damped velocity, σ grows with the time between the frames. The best `WAYS` poses that differ go on (beam search; Viterbi 1967). The
+trunk stays as it was tracked: it is large and hardly ever lost. What is visible of a limb later thus decides where it went before. Where
+the best way differs from the tracked poses, it replaces them only if it explains more (`LEAST_BETTER`). A limb is followed from the frame
+where the fit begins, and stays there as it was found; one that is not certain there (`FitContext.unsure`) is followed from the first frame
+to the last, and may begin anywhere.
 """
 
 from dataclasses import dataclass, replace
