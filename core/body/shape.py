@@ -1,9 +1,10 @@
 """The shape of one person: bone lengths and metaball radii with their sigmas, and its file body.toml.
 
-Radii of the balls of a chain of stout bones (the trunk), adjusted together so that their summed field has a smooth outline.
+Radii of the balls of a body with a trunk, adjusted together so that their summed field has the model's outline.
 
-Radii computed bone by bone (metaballs.three_balls) leave ledges at the trunk's joints, because its balls reach far into the next bone.
-Here the visible radii are joined along the whole chain, and the cross radii l of all its balls are adjusted to that outline together:
+Radii computed bone by bone (metaballs.three_balls) leave ledges at the trunk's joints, because its balls reach far into the next bone, and
+they make a body too thick at hips and shoulders, where the balls of trunk and limbs add. Here the visible radii are joined along the whole
+chain of stout bones, and the cross radii l of all balls are adjusted to the outlines of all bones together, as the fit sums them:
 
     √(−½ ln F(X)) − √(½ ln 2) = 0 at points X of the outline,   ln l = its value bone by bone ± `FREE`
 """
@@ -19,12 +20,12 @@ from ..foundation import bounded, store
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from .anatomy import ball_names
-from .metaballs import ACROSS, VISIBLE, Metaballs, field_and_derivatives, three_balls
+from .metaballs import ACROSS, THRESHOLD, VISIBLE, Metaballs, field, field_and_derivatives, three_balls
 from .model_file import BodyModel, base_dofs, dof_from_table
 from .skeleton import Bone, Skeleton, bone_frames
 
 SAMPLES = 10  # of the outline, per bone
-FREE = 0.5  # sigma of the prior on ln l
+FREE = 0.3  # sigma of the prior on ln l
 TOLERANCE = 0.02  # sigma of the equations
 STEPS = 25  # Gauss-Newton iterations
 LARGEST_STEP = 0.2  # of ln l
@@ -55,16 +56,16 @@ class FieldSamples:
     weight: np.ndarray
 
 
-def smoothed(
-    balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray, stations: np.ndarray
-) -> Metaballs:
-    """The balls with the cross radii of the chain's balls adjusted to its outline. Arguments of all bones, as in `BodyModel`."""
-    R, head = bone_frames(skeleton, lengths_m, np.zeros(len(skeleton.dofs)))
-    X, bone = _outline(R, head, lengths_m, chain, visible_radii_m, stations)
-    mine = np.flatnonzero(np.isin(balls.bone_index, chain))
-    active = skeleton.neighbours[bone][:, balls.bone_index] & np.isin(balls.bone_index, chain)
+def smoothed(balls: Metaballs, model: BodyModel, lengths_m: np.ndarray, chain: list[int]) -> Metaballs:
+    """The balls with their cross radii adjusted to the outlines of all bones, where these do not lie within another part."""
+    R, head = bone_frames(model.skeleton, lengths_m, np.zeros(len(model.skeleton.dofs)))
+    X, bone = _outline(R, head, model, lengths_m, chain)
+    active = model.skeleton.neighbours[bone][:, balls.bone_index]
+    own = (bone[:, None] == balls.bone_index) | (np.isin(bone, chain)[:, None] & np.isin(balls.bone_index, chain))
+    seen = field(balls, lengths_m, R, head, X, active & ~own) < THRESHOLD
+    X, active = X[seen], active[seen]
     samples = FieldSamples(xyz_m=X, active=active, root=np.full(len(X), VISIBLE), weight=np.ones(len(X)))
-    return with_radii_for(balls, mine, lengths_m, R, head, samples)
+    return with_radii_for(balls, np.arange(len(balls.weight)), lengths_m, R, head, samples)
 
 
 def with_radii_for(
@@ -102,23 +103,25 @@ def root_of(F: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, MOST_F)), LEAST_ROOT_SQUARED)))
 
 
-def _outline(
-    R: np.ndarray, head: np.ndarray, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray, stations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) of the outline in the rest pose, in front, behind and at the sides, and their bones (N,)."""
-    axis, base = R[chain[0]][:, 1], head[chain[0]]
-    first = [(head[b] - base) @ axis for b in chain]
-    known = np.concatenate([f + stations[b] * lengths_m[b] for f, b in zip(first, chain)])
-    order = np.argsort(known)
-    radii = np.concatenate([visible_radii_m[b] for b in chain])[order]
+def _outline(R: np.ndarray, head: np.ndarray, model: BodyModel, lengths_m: np.ndarray, chain: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of the outline in the rest pose where it is a bone's own, on its four sides, and their bones (N,)."""
+    groups = [chain, *([b] for b in np.flatnonzero(np.isfinite(model.visible_radii_m).all(axis=(1, 2))).tolist() if b not in chain)]
     points, bones = [], []
-    for f, b in zip(first, chain):
-        low = min(0.0, stations[b, 0]) if b == chain[0] else 0.0
-        along = f + lengths_m[b] * np.linspace(low, 1.0 if b != chain[-1] else stations[b, 2], SAMPLES)
-        for column, side in ((0, R[b][:, 0]), (1, R[b][:, 2])):
-            radius = np.interp(along, known[order], radii[:, column])
-            points.append(base + along[:, None] * axis + radius[:, None] * side)
-            bones.append(np.full(SAMPLES, b))
+    for group in filter(None, groups):
+        axis, base = R[group[0]][:, 1], head[group[0]]
+        first = [(head[b] - base) @ axis for b in group]
+        known = np.concatenate([f + model.stations[b] * lengths_m[b] for f, b in zip(first, group)])
+        order = np.argsort(known)
+        across = np.concatenate([model.visible_radii_m[b] for b in group])[order]
+        aside = np.concatenate([model.aside[b] * lengths_m[b] for b in group])[order]
+        for f, b in zip(first, group):
+            along = f + lengths_m[b] * np.linspace(model.surface[b, 0], model.surface[b, 1], SAMPLES)
+            along = np.clip(along, known.min(), known.max())
+            radius, middle = (np.stack([np.interp(along, known[order], c) for c in both.T], axis=1) for both in (across, aside))
+            centre, sides = base + along[:, None] * axis + middle @ R[b][:, [0, 2]].T, R[b][:, [0, 2]].T
+            for column, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+                points.append(centre + sign * radius[:, column, None] * sides[column])
+                bones.append(np.full(SAMPLES, b))
     return np.concatenate(points), np.concatenate(bones)
 
 
@@ -151,7 +154,7 @@ def default_shape(model: BodyModel) -> BodyShape:
     balls = replace(balls, centre=np.stack([aside[:, 0], balls.centre[:, 1], aside[:, 1]], axis=1))
     chain = stout_chain(model.skeleton, lengths, model.visible_radii_m)
     if chain:
-        balls = smoothed(balls, model.skeleton, lengths, chain, model.visible_radii_m, model.stations)
+        balls = smoothed(balls, model, lengths, chain)
     return BodyShape(
         model=model.name,
         skeleton=model.skeleton,

@@ -15,7 +15,7 @@ import numpy as np
 from ..state import Block, BodyState, FromBlocks, balls_of_parts
 from .surface_point import SurfacePoints
 
-MEAN_STEPS, NEWTON_STEPS = 5, 5  # iterations for t* from the closest approach: fixed point, then Newton
+MEAN_STEPS, NEWTON_STEPS = 5, 12  # iterations for t* from the closest approach: fixed point, then Newton
 LONGEST_M = 0.01  # of a Newton step: where ln F is hardly curved it would be far too long
 DONE_M = 1e-9  # a step after which there is no other
 

@@ -3,10 +3,11 @@
     θ_t⁰ = θ_i + d (θ_i − θ_j) (τ_t − τ_i) / (τ_i − τ_j)                                                  (1)
 
 predicts the pose of frame t from the last two tracked frames i and j at the times τ (constant velocity: 2θ_i − θ_j for equal times); the
-prediction is the start of the adjustment and a weak prior. Tracked points tie the frame to its neighbour. Where the prediction explains far
-less than the neighbour's pose did, the frame is also started from the neighbour's pose; without points, outlines, clicks and keypoints it
-gets the prediction. A frame with clicks is also started from the clicked pose, and if that is better, it corrects the frames before it,
-too. The predicted velocity of an occluded limb is damped by d, and its gate widens with every frame, until the limb reappears.
+prediction is the start of the adjustment and a weak prior. Tracked points tie the frame to its neighbour. Where there is no velocity yet,
+or where the prediction explains far less than the neighbour's pose did, the frame is also started from the neighbour's pose, and from that
+pose moved as the middle of the cloud moved; without points, outlines, clicks and keypoints it gets the prediction. A frame with clicks is
+also started from the clicked pose, and if that is better, it corrects the frames before it, too. The predicted velocity of an occluded limb
+is damped by d, and its gate widens with every frame, until the limb reappears.
 
 `PoseTrackingState` is all that the next frame depends on; it is stored so that an interrupted fit resumes.
 """
@@ -30,6 +31,7 @@ from .hidden_limbs import reacquired_poses
 from .inverse_kinematics import pose_as_clicked, shared_over_time
 
 CHECKPOINT_EVERY = 25  # frames: some seconds of work
+LARGEST_LOSS = 5.0  # of the support, by which another place of a limb may explain fewer points: outlines alone show too little
 LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is also started from its neighbour's pose
 LONGEST_PREDICTION = 5  # frames without a tracked pose; after more the prediction is the last pose
 REACH_M = 0.20  # of the points that take part in one frame
@@ -148,12 +150,12 @@ def _track(given: PoseTracking, state: PoseTrackingState, t: int, direction: int
     """Find the pose of frame t from that of the frame before; correct the frames before it where a click in t shows a better pose."""
     fit, motion, tracked = given.fit, state.motion, state.tracked
     before = given.state(motion[t - direction])
-    near = _subsampled(crop(given.points[t], before, _reach(fit, before)))
+    near = _near(given, t, before)
     damping = np.where(_reappeared(state.observed, tracked), 0.0, _damping(fit, state.unobserved_for))
     target = TargetPose(
         index=t,
         points=near,
-        starts=_predictions(motion, given.time_s, tracked, t, damping),
+        starts=[*_predictions(motion, given.time_s, tracked, t, damping), *_moved(given, motion[tracked[-1]], tracked[-1], near)],
         from_neighbour=_from_neighbour(given.tracks, t, before, direction) if tracked[-1] == t - direction else [],
         neighbour_support=state.support,
         gate_scale=1 + np.minimum(GATE_GROWTH * state.unobserved_for, LARGEST_GATE - 1),
@@ -180,6 +182,21 @@ def _correct_backwards(given: PoseTracking, motion: np.ndarray, clicked: int, di
         if given.score(t, target.points, pose) <= given.score(t, target.points, motion[t]) + fit.least_gain:
             return
         motion[t] = pose
+
+
+def _near(given: PoseTracking, t: int, state: BodyState) -> CloudPoints:
+    """The points of frame t that take part where the body is about in a state."""
+    return _subsampled(crop(given.points[t], state, _reach(given.fit, state)))
+
+
+def _moved(given: PoseTracking, pose: np.ndarray, at: int, points: CloudPoints) -> list[np.ndarray]:
+    """The pose (D,) of frame `at`, moved as the middle of the body's points."""
+    own = _near(given, at, given.state(pose)).xyz_m
+    if not len(own) or not len(points.xyz_m):
+        return []
+    moved = pose.copy()
+    moved[given.fit.model.skeleton.layout.group("base")] += np.median(points.xyz_m, axis=0) - np.median(own, axis=0)
+    return [moved]
 
 
 def _reach(fit: FitContext, state: BodyState) -> np.ndarray:
@@ -236,7 +253,7 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
         pose, support, score = _adjusted(given, target, start, monitor)
         if score > best_score:
             best, best_support, best_score = pose, support, score
-        if target.neighbour_support is None or best_support > LOST_SUPPORT * target.neighbour_support:
+        if target.neighbour_support is not None and best_support > LOST_SUPPORT * target.neighbour_support:
             break
     if i in fit.places:
         clicked = pose_as_clicked(fit.parameters, fit.places[i], best, given.first.vector)
@@ -245,7 +262,7 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
             best, best_support, best_score = pose, support, score
     for start in reacquired_poses(fit, i, target.points, best, given.first.vector, monitor):
         pose, support, score = _adjusted(given, target, start, monitor)
-        if score > best_score + fit.least_gain:
+        if score > best_score + fit.least_gain and support > best_support - LARGEST_LOSS:
             best, best_support, best_score = pose, support, score
     return (best, best_support) if best_support >= fit.settings.min_points or fit.joints(i) else (target.starts[0], None)
 

@@ -114,7 +114,7 @@ def test_calves_lie_behind_and_outside_of_their_bones() -> None:
         mass = np.prod(balls.radii_m[mine][:, [0, 2]], axis=1)
         centre = mass @ world / mass.sum()
         assert centre[1] == pytest.approx(0.0485, abs=0.004) and outwards * centre[0] == pytest.approx(0.019, abs=0.002)
-    assert not balls.centre[balls.bone_index == names.index("thigh.L")][:, [0, 2]].any()
+    assert not balls.centre[balls.bone_index == names.index("forearm.L")][:, [0, 2]].any()
 
 
 def test_a_model_whose_balls_lie_aside_of_nothing_is_refused(tmp_path: Path) -> None:

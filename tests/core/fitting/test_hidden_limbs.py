@@ -152,7 +152,7 @@ def test_the_foot_of_one_who_squats_is_found_flat_on_the_floor(standing) -> None
     }
     (found,) = reacquired_poses(fit, 0, points_of(shape, squatting, seen | {"foot.R": 80}), before, fit.parameters.vector(shape))
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["toe.R"] for m in (squatting, before, found))
-    assert np.linalg.norm(was - true) > 0.09 and np.linalg.norm(now - true) < 0.02
+    assert np.linalg.norm(was - true) > 0.09 and np.linalg.norm(now - true) < 0.03
 
 
 def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> None:
