@@ -3,11 +3,11 @@
     θ_t⁰ = θ_i + d (θ_i − θ_j) (τ_t − τ_i) / (τ_i − τ_j)                                                  (1)
 
 predicts the pose of frame t from the last two tracked frames i and j at the times τ (constant velocity: 2θ_i − θ_j for equal times); the
-prediction is the start of the adjustment and a weak prior. Tracked points tie the frame to its neighbour. Where there is no velocity yet,
-or where the prediction explains far less than the neighbour's pose did, the frame is also started from the neighbour's pose, and from that
-pose moved as the middle of the cloud moved; without points, outlines, clicks and keypoints it gets the prediction. A frame with clicks is
-also started from the clicked pose, and if that is better, it corrects the frames before it, too. The predicted velocity of an occluded limb
-is damped by d, and its gate widens with every frame, until the limb reappears.
+prediction is the start of the adjustment and a weak prior. Tracked points tie the frame to its neighbour. The first frame has no velocity:
+it is started from the click frame's pose, and from that moved as the middle of the cloud moved. Where the prediction explains far less than
+the neighbour's pose did, the frame is also started from the neighbour's pose; without points, outlines, clicks and keypoints it gets the
+prediction. A frame with clicks is also started from the clicked pose, and if that is better, it corrects the frames before it, too. The
+predicted velocity of an occluded limb is damped by d, and its gate widens with every frame, until the limb reappears.
 
 `PoseTrackingState` is all that the next frame depends on; it is stored so that an interrupted fit resumes.
 """
@@ -155,7 +155,9 @@ def _track(given: PoseTracking, state: PoseTrackingState, t: int, direction: int
     target = TargetPose(
         index=t,
         points=near,
-        starts=[*_predictions(motion, given.time_s, tracked, t, damping), *_moved(given, motion[tracked[-1]], tracked[-1], near)],
+        starts=_predictions(motion, given.time_s, tracked, t, damping)
+        if len(tracked) > 1
+        else _without_velocity(given, motion, tracked[-1], near),
         from_neighbour=_from_neighbour(given.tracks, t, before, direction) if tracked[-1] == t - direction else [],
         neighbour_support=state.support,
         gate_scale=1 + np.minimum(GATE_GROWTH * state.unobserved_for, LARGEST_GATE - 1),
@@ -189,14 +191,13 @@ def _near(given: PoseTracking, t: int, state: BodyState) -> CloudPoints:
     return _subsampled(crop(given.points[t], state, _reach(given.fit, state)))
 
 
-def _moved(given: PoseTracking, pose: np.ndarray, at: int, points: CloudPoints) -> list[np.ndarray]:
-    """The pose (D,) of frame `at`, moved as the middle of the body's points."""
-    own = _near(given, at, given.state(pose)).xyz_m
+def _without_velocity(given: PoseTracking, motion: np.ndarray, last: int, points: CloudPoints) -> list[np.ndarray]:
+    """The pose of frame `last`, and the same moved as the middle of the body's points."""
+    own, moved = _near(given, last, given.state(motion[last])).xyz_m, motion[last].copy()
     if not len(own) or not len(points.xyz_m):
-        return []
-    moved = pose.copy()
+        return [moved]
     moved[given.fit.model.skeleton.layout.group("base")] += np.median(points.xyz_m, axis=0) - np.median(own, axis=0)
-    return [moved]
+    return [motion[last], moved]
 
 
 def _reach(fit: FitContext, state: BodyState) -> np.ndarray:

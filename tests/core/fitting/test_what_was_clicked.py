@@ -24,7 +24,7 @@ def projected(scene: Scene, frame: int, *joints: str) -> dict:
     return {name: {c.name: c.project(scene.joints_m[frame, names.index(name)]) for c in scene.rig.cameras} for name in joints}
 
 
-@pytest.mark.parametrize(("shoulder", "elbow"), [(-75, 45), (-110, 60)])
+@pytest.mark.parametrize(("shoulder", "elbow"), [(-75, 45), (-110, 60), (60, -60)])
 def test_a_limb_that_went_wrong_is_corrected_by_a_click_after_it_and_before_it(make_scene, shoulder: int, elbow: int) -> None:
     scene = make_scene(frames=9, seed=1)
     layout = scene.shape.skeleton.layout
@@ -38,7 +38,7 @@ def test_a_limb_that_went_wrong_is_corrected_by_a_click_after_it_and_before_it(m
         errors.append(np.linalg.norm(fit.motion.joints_m[:, 2] - scene.joints_m[:, 2], axis=1))
     assert (errors[0][4:] > 0.15).all(), "or there is nothing to correct"
     assert errors[1][6] < 0.01
-    assert errors[1][4] < 0.25 and (errors[1][[5, 7, 8]] < 0.04).all()  # frame 3 is next to those that stay wrong
+    assert errors[1][4] < 0.19 and (errors[1][[5, 7, 8]] < 0.04).all()  # frame 3 is next to those that stay wrong
 
 
 def test_joints_that_do_not_lie_where_they_were_clicked_are_told(make_scene) -> None:
