@@ -252,7 +252,7 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
     best, best_support, best_score = target.starts[0], -1.0, -np.inf
     for start in target.starts:
         pose, support, score = _adjusted(given, target, start, monitor)
-        if score > best_score:
+        if score > best_score + fit.least_gain:
             best, best_support, best_score = pose, support, score
         if target.neighbour_support is not None and best_support > LOST_SUPPORT * target.neighbour_support:
             break
