@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -68,12 +68,25 @@ def read_rig(path: Path) -> Rig:
     cameras = tuple(_camera(key, entry, path, UNITS_M[unit]) for key, entry in table.items() if key.startswith("cam"))
     if not cameras:
         raise InputError(f"The rig {path} has no cameras; it needs tables [cam_0], [cam_1], …")
-    names = [c.name for c in cameras]
-    if len(set(names)) < len(names):
-        raise InputError(f"The rig {path} has two cameras of the same name ({', '.join(names)}); give each its own name.")
+    check_camera_names(cameras, f"The rig {path}")
     tables = [entry for key, entry in table.items() if key.startswith("cam")]
     sigmas = {c.name: sigmas_of(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
     return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
+
+
+def check_camera_names(cameras: Sequence[Camera], label: str) -> None:
+    """Check that the names of cameras are names: messages, files of other tools and the scene use them. `label` begins the message.
+
+    Raises:
+        InputError: two are the same, or one is empty, has several lines or control characters.
+    """
+    names = [camera.name for camera in cameras]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{label} has two cameras of the name “{twice}”; give each its own name.")
+    unfit = next((name for name in names if not bounded.is_plain(name)), None)
+    if unfit is not None:
+        raise InputError(f"{label} has a camera of the name {unfit!r}; give it a name in one line, such as “L”.")
 
 
 def sigmas_of(table: Any, name: str, path: Path) -> dict[str, float]:

@@ -3,7 +3,6 @@
 Joint and view names, and every key, are checked when the file is read; the images are not read.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,8 +61,6 @@ TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY = "none"  # `model` under [body]
-DEVICES = r"^(con|prn|aux|nul|com[1-9¹²³]|lpt[1-9¹²³]) *(\.|$)"  # of Windows, whatever follows the dot
-UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|[. ]$|' + DEVICES, re.IGNORECASE)  # a view's name is used in file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -282,7 +279,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
             raise InputError(f'A {label} needs a name (text), such as "L".')
         if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
             raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
-        if UNFIT_FOR_NAMES.search(entry["name"]):
+        if not bounded.fits_file_names(entry["name"]):  # it is used in file names
             raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
