@@ -27,7 +27,11 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
 
 def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     parser = build_parser(adders)
-    args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
+    try:
+        args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
+    except InputError as error:  # of the help text, which cannot be written
+        streams.write_line(f"tricap: {error}", sys.stderr)
+        return 2
     args.parser = parser
     import cv2
 

@@ -48,10 +48,14 @@ def test_every_line_ends_with_the_code_of_what_was_found(rig: Path) -> None:
     assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr, done.stderr
 
 
-def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path) -> None:
-    done = shell("tricap check RIG > /dev/full", rig)
+@pytest.mark.parametrize("arguments", ["check RIG", "check RIG --json", "--help", "run --help"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path, arguments: str, unbuffered: str) -> None:
+    done = shell(f"tricap {arguments} > /dev/full; exit $?", rig, PYTHONUNBUFFERED=unbuffered)
     assert done.returncode == 2 and done.stderr.decode().startswith("tricap: Cannot write the output of this command: No space"), done
     assert done.stderr.count(b"\n") == 1
+    assert b"required: COMMAND" in shell("tricap > /dev/full", rig).stderr.splitlines()[-1]  # nothing was to be written there
+    assert shell("tricap --help | head -c 0; exit ${PIPESTATUS[0]}", rig).returncode == 0
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
