@@ -97,7 +97,7 @@ def _progress_line(monitor: Monitor) -> Callable[[str, float, float], None]:
         left = None if course is None else course.seconds_left
         more = "" if left is None else f"{time_text(left)} left"
         end = "\n" if whole >= 1 else ""
-        streams.write(f"\r{stage:<24} [{'#' * round(30 * whole):<30}] {100 * whole:3.0f} %  {more:<16}{end}", sys.stderr)
+        streams.write(f"\r{streams.visible(stage):<24} [{'#' * round(30 * whole):<30}] {100 * whole:3.0f} %  {more:<16}{end}", sys.stderr)
 
     return report
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tricap.core.cli.main import _progress_line
+from tricap.core.cli.streams import write_line
 from tricap.core.foundation.errors import InputError, sentence_of
 from tricap.core.foundation.progress import Monitor
 
@@ -65,6 +66,16 @@ def test_every_encoding_takes_every_character(rig: Path, encoding: str) -> None:
     assert plain.returncode == 1 and b"Traceback" not in plain.stderr, plain
     found = json.loads(text[text.index("{") :])
     assert "é“\U0001f600" in str(found), text
+
+
+def test_what_names_would_do_to_a_terminal_is_shown_instead(capfd: pytest.CaptureFixture[str]) -> None:
+    """Escape sequences, and marks that turn the direction of writing; JSON stays what it was."""
+    evil = "a\x1b]0;pwn\x07\x9b31m\u202eé\u200d\U0001f600\ttab\x7f"
+    for line in (f"{evil}\nsecond", json.dumps({"a": evil}, ensure_ascii=False)):
+        write_line(line, sys.stdout)
+    shown = capfd.readouterr().out
+    assert shown.startswith("a\\u001b]0;pwn\\u0007\\u009b31m\\u202eé\u200d\U0001f600\ttab\\u007f\nsecond\n{")
+    assert json.loads(shown.splitlines()[-1]) == {"a": evil}
 
 
 def test_a_progress_bar_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
