@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Cancelled, Monitor, time_text
 from . import streams
-from .arguments import with_joined_frames
+from .arguments import check_outputs, with_joined_frames
 from .parser import Adder, build_parser
 
 
@@ -40,6 +40,7 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     if not args.quiet:
         monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress()
     try:
+        check_outputs(args)
         with _interrupts(monitor), threadpool_limits(1, user_api="blas"):  # those that Blender has loaded
             lines = args.run(args, monitor)
         for line in lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", []):

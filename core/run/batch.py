@@ -65,7 +65,8 @@ def run_batch(
     place there is reported, and the others run.
 
     Raises:
-        InputError: Dask is not installed, the scheduler cannot be reached, or the folder cannot be written to, or is a take.
+        InputError: Dask is not installed, the scheduler cannot be reached, the folder cannot be written to or is a take, or no take has
+            a place in it.
         Cancelled: finished work is saved; the same command resumes.
     """
     outs, refused = out_folders(takes, folder)
@@ -91,7 +92,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> tuple[list[Path], dict[i
     Names that differ only in capitals are the same, as on the disks of Windows and macOS. Also why some takes cannot have theirs.
 
     Raises:
-        InputError: FOLDER is a take.
+        InputError: FOLDER is a take, or no take can have its results in it.
     """
     folder, takes = real_path(folder), [real_path(take) for take in takes]
     check_separate_folder(folder)
@@ -107,6 +108,8 @@ def out_folders(takes: Sequence[Path], folder: Path) -> tuple[list[Path], dict[i
             check_inside(out, folder)
         except InputError as error:
             refused[i] = str(error)
+    if len(refused) == len(takes):
+        raise InputError(refused[0])
     return outs, refused
 
 
