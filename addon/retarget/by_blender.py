@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from ...core.results.folder import check_inside
 from ..scene import skin
 from . import playing, programs
 from .build import build_armature
+from .own_textures import own_textures
 from .programs import Program, bone_names
 
 FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
@@ -109,7 +110,12 @@ def _write(kind: str, file: Path, program: Program, armature_object: bpy.types.O
         armature_object.data.bones[name].name = new  # vertex groups and curves follow
     scene = bpy.context.scene
     scene.frame_set(scene.frame_start)
-    write_whole(file, lambda part: EXPORTERS[kind](part, program))
+
+    def export(part: str) -> None:
+        with own_textures(scene, file.name) if kind == "usd" else nullcontext():
+            EXPORTERS[kind](part, program)
+
+    write_whole(file, export)
 
 
 def write_whole(file: Path, export: Callable[[str], Any]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from ...core.foundation import bounded, store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
+from ...core.images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
 from ...core.motion.formats.bvh import write_bvh
 from ...core.motion.formats.c3d import Segments, write_c3d
 from ...core.motion.formats.markers import Markers, metres_per, rate, write_points_csv
@@ -19,6 +20,7 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from ...core.motion.tables import read_joints
 from ...core.results.folder import check_not_result
+from ...core.results.outputs import check_output
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
@@ -27,6 +29,8 @@ POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")} 
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
 ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "mot", "fbx", "abc", *POINTS)} | {
     "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
+
+OTHERS = (*IMAGE_ENDINGS, *MOVIE_ENDINGS, ".toml", ".json", ".npz", ".blend")  # of what is no motion: probably a slip
 
 
 def named_for(kind: str, file: Path, out: Path | None) -> Path:
@@ -37,9 +41,10 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
     """
     ending = file.suffix.lower()
     if kind != "ply" and ending not in ENDINGS[kind]:
-        if any(ending in others for others in ENDINGS.values()):
+        if ending in OTHERS or any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    check_output(file, [] if out is None else [out])
     if out is not None:
         check_not_result(file, out)
         if kind == "mot":

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
+from ...core.motion.plausible import check_span
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
@@ -230,15 +231,18 @@ def action_frames(armature_object: bpy.types.Object) -> range:
     """The whole frames of an armature's action.
 
     Raises:
-        InputError: it has none.
+        InputError: it has none, or has some keys in very many frames.
     """
     data = armature_object.animation_data
     if data is None or (data.action is None and not data.nla_tracks):
         raise InputError(f"The armature “{armature_object.name}” has no action; choose one with an action.")
     if data.action is None:
-        scene = bpy.context.scene
-        return range(scene.frame_start, scene.frame_end + 1)
-    first, last = data.action.frame_range
+        first, last = float(bpy.context.scene.frame_start), float(bpy.context.scene.frame_end)
+        actions = [strip.action for track in data.nla_tracks for strip in track.strips if strip.action is not None]
+    else:
+        (first, last), actions = data.action.frame_range, [data.action]
+    keys = sum(len(curve.keyframe_points) for action in actions for curve in curves_of(action))
+    check_span(first, last, keys, f"The action of “{armature_object.name}” reaches")
     return range(int(np.ceil(first - 1e-4)), int(np.floor(last + 1e-4)) + 1)
 
 

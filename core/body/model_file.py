@@ -15,7 +15,7 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.arrays import frozen
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
 from .metaballs import STATIONS
 from .skeleton import Bone, Dof, Skeleton
@@ -95,7 +95,7 @@ def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
 
 def _path(name: Any, folder: Path) -> Path:
     if not isinstance(name, str | Path):
-        raise InputError(f'A body model in {folder} is made from {name!r}; write the name of a model, such as "arm.R", or a .toml file.')
+        raise InputError(f'A body model in {folder} is made from {shown(name)}; write the name of a model ("arm.R") or of a .toml file.')
     if str(name).endswith(".toml"):
         if folder != Path() and Path(name).name != str(name):
             raise InputError(f"A body model in {folder} is made from “{name}”; the file must be in the same folder.")

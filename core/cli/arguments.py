@@ -13,6 +13,8 @@ from ..foundation import bounded
 from ..foundation.errors import InputError
 
 MOST_DIGITS = 12  # of a frame number
+OUTPUTS = ("printed", "preview", "blend", "file", "report", "pictures")  # arguments that name what is written
+WITH_OUT = ("calibrate", "track2d", "fields")  # commands with a file, or some, for --out; those with a folder for a run check that
 
 
 def overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
@@ -76,6 +78,18 @@ def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
     for path in read:
         if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
             raise InputError(f"{flag} {out} is also an input; choose another name, so that it is not overwritten.")
+
+
+def check_outputs(args: argparse.Namespace) -> None:
+    """Check that no file which the command is to write is one that it reads, or a part of a take.
+
+    Raises:
+        InputError: it is.
+    """
+    from ..results import outputs
+
+    names = (*OUTPUTS, "out") if args.command in WITH_OUT else OUTPUTS
+    outputs.check_outputs(vars(args), names, may_be_rig=args.command == "calibrate")
 
 
 def check_simplify(degrees: float) -> None:

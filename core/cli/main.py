@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Cancelled, Monitor, time_text
 from . import streams
-from .arguments import with_joined_frames
+from .arguments import check_outputs, with_joined_frames
 from .parser import Adder, build_parser
 
 
@@ -27,7 +27,11 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
 
 def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     parser = build_parser(adders)
-    args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
+    try:
+        args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
+    except InputError as error:  # of the help text, which cannot be written
+        streams.write_line(f"tricap: {error}", sys.stderr)
+        return 2
     args.parser = parser
     import cv2
 
@@ -36,6 +40,7 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     if not args.quiet:
         monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress()
     try:
+        check_outputs(args)
         with _interrupts(monitor), threadpool_limits(1, user_api="blas"):  # those that Blender has loaded
             lines = args.run(args, monitor)
         for line in lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", []):
@@ -93,7 +98,7 @@ def _progress_line(monitor: Monitor) -> Callable[[str, float, float], None]:
         left = None if course is None else course.seconds_left
         more = "" if left is None else f"{time_text(left)} left"
         end = "\n" if whole >= 1 else ""
-        streams.write(f"\r{stage:<24} [{'#' * round(30 * whole):<30}] {100 * whole:3.0f} %  {more:<16}{end}", sys.stderr)
+        streams.write(f"\r{streams.visible(stage):<24} [{'#' * round(30 * whole):<30}] {100 * whole:3.0f} %  {more:<16}{end}", sys.stderr)
 
     return report
 

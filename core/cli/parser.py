@@ -5,6 +5,7 @@ A command's module is imported when it runs: help and invalid arguments need nei
 
 import argparse
 import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from ..body.model_file import model_names
 from ..foundation.progress import Monitor
 from ..images.interlace import BOTH, INTERLACE
+from . import streams
 from .arguments import named_path
 
 # Adds a sub-command to the parser. The command's `run(args, monitor)` returns the lines to show, and sets `args.always_shown` to those
@@ -35,9 +37,17 @@ def action(module: str, name: str = "run") -> Action:
     return run
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser, also of a command, whose help text is written as all output is: argparse ignores a full disk."""
+
+    def print_help(self, file: Any = None) -> None:
+        """Write the help text; raises an InputError where that fails."""
+        streams.write(self.format_help(), sys.stdout if file is None else file)
+
+
 def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
-    parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
+    parser = _Parser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_new, _stages, _joints, _synchronise, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
         add(commands)

@@ -14,6 +14,7 @@ from typing import Any
 
 from ..foundation.errors import InputError
 
+JOINERS = "\u200c\u200d"  # invisible, and harmless parts of words and pictures
 ESCAPED = "tricap-escaped"  # the name of our error handler
 NOBODY_READS = {errno.EPIPE, errno.ESHUTDOWN, *({errno.EINVAL} if os.name == "nt" else set())}
 
@@ -22,8 +23,18 @@ def _escaped(error: UnicodeError) -> tuple[str, int]:
     """Characters that an encoding lacks, as in JSON: \\u201c, in two parts beyond 16 bits."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    units = error.object[error.start : error.end].encode("utf-16-be", "surrogatepass").hex()
-    return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4)), error.end
+    return _as_in_json(error.object[error.start : error.end]), error.end
+
+
+def _as_in_json(text: str) -> str:
+    units = text.encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4))
+
+
+def visible(text: str) -> str:
+    """A text in which names from files cannot steer a terminal or turn the direction of writing; what would becomes \\u001b and the like,
+    which leaves JSON what it was."""
+    return text if text.isprintable() else "".join(c if c.isprintable() or c in "\n\t" + JOINERS else _as_in_json(c) for c in text)
 
 
 codecs.register_error(ESCAPED, _escaped)
@@ -49,12 +60,12 @@ def robust() -> Iterator[None]:
 
 
 def write_line(text: str, stream: Any) -> None:
-    """Write a line and flush it; where nobody reads it, it and all further ones are dropped.
+    """Write a line, as `visible`, and flush it; where nobody reads it, it and all further ones are dropped.
 
     Raises:
         InputError: it cannot be written to standard output, such as to a file on a full disk.
     """
-    write(f"{text}\n", stream)
+    write(f"{visible(text)}\n", stream)
 
 
 def write(text: str, stream: Any) -> None:

@@ -34,6 +34,9 @@ DEEPEST = 64  # tables and lists in each other
 TOO_DEEP = f"more than {DEEPEST} tables and lists in each other"
 WHOLE_BITS = 63  # of a whole number, as TOML has it
 PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+DEVICES = r"^(con|prn|aux|nul|com[1-9¹²³]|lpt[1-9¹²³]) *(\.|$)"  # of Windows, whatever follows the dot
+UNFIT_FOR_NAMES = re.compile(r'^$|[/\\:*?"<>|\x00-\x1f\x7f]|[. ]$|' + DEVICES, re.IGNORECASE)
+LINE_BREAKS_AND_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 LONG_KEY = re.compile(rf"(?<![\w.-]){PART}(?:[ \t]*+\.[ \t]*+{PART}){{{MOST_KEY_PARTS}}}")
 
 
@@ -80,6 +83,16 @@ def check_name(path: Path) -> None:
         str(path).encode()
     except UnicodeEncodeError as error:
         raise InputError(f"The name of {_shown(path)} is not UTF-8; rename it, or a folder above it.") from error
+
+
+def is_plain(name: str) -> bool:
+    """Whether a name from a file is one line of text, which can be written into a line of another file."""
+    return bool(name.strip()) and LINE_BREAKS_AND_CONTROLS.search(name) is None
+
+
+def fits_file_names(name: str) -> bool:
+    """Whether a name from a file can be the name of a file, or begin it, on every system, and leads to no other folder."""
+    return is_plain(name) and UNFIT_FOR_NAMES.search(name) is None
 
 
 def _shown(path: Path) -> str:

@@ -1,9 +1,13 @@
 """The error that a user can correct, and the sentence for faults of the computer. Any other exception is a bug."""
 
+import json
+from datetime import date, time
+
 NO_MEMORY = -4  # OpenCV's code
 NO_THREAD = "can't start new thread"  # what Python says where the limit of memory or of processes is reached
 NO_ROOM = ("failed to map segment", "Cannot allocate memory")  # what the system's loader says of a library for which there is no memory
 LONGEST = 1500  # characters of a message
+LONGEST_VALUE = 80  # and of a value that it quotes
 
 
 class InputError(Exception):
@@ -15,6 +19,14 @@ class InputError(Exception):
     def __init__(self, message: str = "") -> None:
         text = "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in str(message))
         super().__init__(text if len(text) <= LONGEST else text[: LONGEST // 2] + " … " + text[-LONGEST // 2 :])
+
+
+def shown(value: object) -> str:
+    """A value of a TOML or JSON file in a message: as it is written there, shortened."""
+    if value is None:
+        return "missing"
+    text = str(value) if isinstance(value, (date, time, float)) else json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} …"
 
 
 def sentence_of(error: BaseException) -> str | None:

@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from .errors import InputError
+from .errors import InputError, shown
 
 T = TypeVar("T")
 LARGEST_NUMBER = 1e300  # beyond: infinity, or a whole number that no float can hold
@@ -97,16 +97,16 @@ def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:
     label = f"Setting “{field.name}” of {where}"
     if isinstance(default, bool):
         if not isinstance(value, bool):
-            raise InputError(f"{label} is {value!r}; write true or false.")
+            raise InputError(f"{label} is {shown(value)}; write true or false.")
         return value
     if isinstance(default, str):
         if not isinstance(value, str) or (meta.get("choices") and value not in meta["choices"]):
-            raise InputError(f"{label} is {value!r}; choose one of: {', '.join(meta.get('choices') or ('a text',))}.")
+            raise InputError(f"{label} is {shown(value)}; choose one of: {', '.join(meta.get('choices') or ('a text',))}.")
         return value
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST_NUMBER:
         raise InputError(f"{label} is {repr(value)[:40]}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
     if isinstance(default, int) and value != int(value):
-        raise InputError(f"{label} is {value!r}; a whole number is needed.")
+        raise InputError(f"{label} is {shown(value)}; a whole number is needed.")
     low, high = meta.get("low"), meta.get("high")
     if (low is not None and value < low) or (high is not None and value > high):
         raise InputError(f"{label} is {value:g} {meta.get('unit', '')}; it must lie between {low} and {high}.".replace(" ;", ";"))

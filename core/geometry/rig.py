@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from ..foundation import bounded, store
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
 from .camera import Camera
 from .rotation import rotation_from_vector, vector_from_rotation
 
 LARGEST_NUMBER = 1e12  # of a calibration in any unit; beyond it, powers of it overflow
+MOST_CAMERAS = 200  # much is done for every pair of them
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
@@ -64,16 +65,32 @@ def read_rig(path: Path) -> Rig:
     metadata = table.get("metadata", {})
     unit = metadata.get("unit", "m") if isinstance(metadata, dict) else None
     if not isinstance(unit, str) or unit not in UNITS_M:
-        raise InputError(f"The rig {path} is in an unknown unit {unit!r}; write one of {', '.join(UNITS_M)} under [metadata].")
+        raise InputError(f"The rig {path} is in an unknown unit {shown(unit)}; write one of {', '.join(UNITS_M)} under [metadata].")
     cameras = tuple(_camera(key, entry, path, UNITS_M[unit]) for key, entry in table.items() if key.startswith("cam"))
     if not cameras:
         raise InputError(f"The rig {path} has no cameras; it needs tables [cam_0], [cam_1], …")
-    names = [c.name for c in cameras]
-    if len(set(names)) < len(names):
-        raise InputError(f"The rig {path} has two cameras of the same name ({', '.join(names)}); give each its own name.")
+    check_cameras(cameras, f"The rig {path}")
     tables = [entry for key, entry in table.items() if key.startswith("cam")]
     sigmas = {c.name: sigmas_of(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
     return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
+
+
+def check_cameras(cameras: Sequence[Camera], label: str) -> None:
+    """Check the number of cameras, and that their names are names, which messages, files of other tools and the scene use. `label` begins
+    the message.
+
+    Raises:
+        InputError: they are too many, two have the same name, or one is empty, has several lines or control characters.
+    """
+    if len(cameras) > MOST_CAMERAS:
+        raise InputError(f"{label} has {len(cameras)} cameras; a rig has at most {MOST_CAMERAS}. Leave out those that are not used.")
+    names = [camera.name for camera in cameras]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{label} has two cameras of the name “{twice}”; give each its own name.")
+    unfit = next((name for name in names if not bounded.is_plain(name)), None)
+    if unfit is not None:
+        raise InputError(f"{label} has a camera of the name {shown(unfit)}; give it a name in one line, such as “L”.")
 
 
 def sigmas_of(table: Any, name: str, path: Path) -> dict[str, float]:

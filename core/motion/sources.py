@@ -63,7 +63,7 @@ def from_run(out: Path) -> Motion:
     first, last = np.flatnonzero(known)[[0, -1]]
     frames = table.frames[first : last + 1]
     values = np.stack([np.interp(frames, table.frames[known], column) for column in table.values[known].T], axis=1)
-    return body_motion(shape, values, frames, rate(table.frames, table.time_s))
+    return body_motion(shape, values, frames, rate(table.frames, table.time_s, out / "motion.csv"))
 
 
 def body_motion(shape: BodyShape, values: np.ndarray, frames: np.ndarray, fps: float) -> Motion:

@@ -20,8 +20,8 @@ from ..body.skeleton import Skeleton
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse, frozen
 from ..foundation.errors import InputError
+from .plausible import LARGEST_FRAME, check_times
 
-LARGEST_FRAME = 2**53
 JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
 LATER_COLUMNS = ("sigma_frame", "known")
 
@@ -97,6 +97,7 @@ def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
     names = skeleton.dof_names
     columns = [_column(header, name, path) for name in ("frame", "time_s", *names, *(f"sigma {name}" for name in names))]
     table = np.array([[_number(row[c], path, line) for c in columns] for line, row in enumerate(rows, 2)]).reshape(-1, len(columns))
+    check_times(table[:, 0], 1.0, f"{path} has rows")
     d, factor = len(names), _to_file(skeleton, names)
     return MotionTable(
         frames=table[:, 0], time_s=table[:, 1], dof_names=names, values=table[:, 2 : 2 + d] / factor, sigma=table[:, 2 + d :] / factor
@@ -119,6 +120,8 @@ def read_joints(path: Path) -> JointTable:
         frame = _whole(row[columns["frame"]], path, line)
         times[frame] = _number(row[columns["time_s"]], path, line)
         joint, own = row[columns["joint"]], np.nan if frame_sigma is None else _number(row[frame_sigma], path, line)
+        if frame in found.get(joint, {}):
+            raise InputError(f"Row {line} of {path} is the second for “{joint[:40]}” in frame {frame}; remove one of them.")
         found.setdefault(joint, {})[frame] = [*(_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")), own]
         words.setdefault(joint, {})[frame] = "" if word is None else _word(row[word], path, line)
     frames = sorted(times)

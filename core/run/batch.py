@@ -61,47 +61,56 @@ class Outcome:
 def run_batch(
     takes: Sequence[Path], folder: Path, engine: Engine, overrides: Overrides, monitor: Monitor, *, restart: bool = False
 ) -> list[Outcome]:
-    """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each.
+    """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each; a take whose results have no
+    place there is reported, and the others run.
 
     Raises:
-        InputError: Dask is not installed, the scheduler cannot be reached, two takes have one name, or the folder cannot be written to.
+        InputError: Dask is not installed, the scheduler cannot be reached, the folder cannot be written to or is a take, or no take has
+            a place in it.
         Cancelled: finished work is saved; the same command resumes.
     """
-    outs = out_folders(takes, folder)
-    outcomes: dict[int, Outcome] = {}
+    outs, refused = out_folders(takes, folder)
+    outcomes = {i: Outcome(take=str(takes[i]), out=str(outs[i]), status=Status.INVALID_INPUT, said=said) for i, said in refused.items()}
     _write(folder, engine, takes, outs, outcomes)
     progress: dict[str, Progress] = {}
     with dask_client(engine) as client:
         client.subscribe_topic(TOPIC, lambda event: _store_progress(event, progress))
         plain = {group: dict(table) for group, table in overrides.items()}
-        futures = [
-            client.submit(run_take, str(real_path(take)), str(out), plain, restart, pure=False, retries=engine.retries)
-            for take, out in zip(takes, outs)
-        ]
+        futures = {
+            i: client.submit(run_take, str(real_path(take)), str(out), plain, restart, pure=False, retries=engine.retries)
+            for i, (take, out) in enumerate(zip(takes, outs))
+            if i not in refused
+        }
         for i, outcome in _as_completed(futures, takes, outs, progress, monitor):
             outcomes[i] = outcome
             _write(folder, engine, takes, outs, outcomes)
     return [outcomes[i] for i in range(len(takes))]
 
 
-def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
+def out_folders(takes: Sequence[Path], folder: Path) -> tuple[list[Path], dict[int, str]]:
     """The folder of each take's results: named after the take, with its parent folder's name in front where two takes have the same name.
-    Names that differ only in capitals are the same, as on the disks of Windows and macOS.
+    Names that differ only in capitals are the same, as on the disks of Windows and macOS. Also why some takes cannot have theirs.
 
     Raises:
-        InputError: two names are still the same, or results would go into a take or through a link out of FOLDER.
+        InputError: FOLDER is a take, or no take can have its results in it.
     """
     folder, takes = real_path(folder), [real_path(take) for take in takes]
+    check_separate_folder(folder)
     same = Counter(take.name.casefold() for take in takes)
     names = [f"{take.parent.name}_{take.name}" if same[take.name.casefold()] > 1 else take.name for take in takes]
-    same = Counter(map(str.casefold, names))
-    twice = next((take for take, name in zip(takes, names) if same[name.casefold()] > 1), None)
-    if twice is not None:
-        raise InputError(f"The take {twice} is listed twice, or has the name of another one; rename its folder, or leave it out.")
-    for out in (folder, *(folder / name for name in names)):
-        check_separate_folder(out)
-        check_inside(out, folder)
-    return [folder / name for name in names]
+    outs, taken, refused = [folder / name for name in names], set[str](), dict[int, str]()
+    for i, out in enumerate(outs):
+        try:
+            if names[i].casefold() in taken:
+                raise InputError(f"{takes[i]} is listed twice, or has the name of another take; rename its folder, or leave it out.")
+            taken.add(names[i].casefold())
+            check_separate_folder(out)
+            check_inside(out, folder)
+        except InputError as error:
+            refused[i] = str(error)
+    if len(refused) == len(takes):
+        raise InputError(refused[0])
+    return outs, refused
 
 
 def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[str, Any]:
@@ -171,10 +180,10 @@ def _store_progress(event: tuple[float, Any], progress: dict[str, Progress]) -> 
 
 
 def _as_completed(
-    futures: Sequence[Any], takes: Sequence[Path], outs: Sequence[Path], progress: Mapping[str, Progress], monitor: Monitor
+    futures: Mapping[int, Any], takes: Sequence[Path], outs: Sequence[Path], progress: Mapping[str, Progress], monitor: Monitor
 ) -> Iterator[tuple[int, Outcome]]:
     """The index and the outcome of each take as soon as it has ended."""
-    waiting, reported = dict(enumerate(futures)), dict[str, Progress]()
+    waiting, reported = dict(futures), dict[str, Progress]()
     while waiting:
         ended = [i for i, future in waiting.items() if future.done()]
         for i in ended:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.arrays import frozen
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, shown
 from .sources import is_number
 
 if TYPE_CHECKING:
@@ -95,17 +95,17 @@ def view_clock(entry: Mapping[str, Any], label: str) -> dict[str, Any]:
     """
     fps, start, drift = entry.get("fps"), entry.get("start", 0.0), entry.get("drift_ppm", 0.0)
     if fps is not None and not (is_number(fps) and 0.1 <= fps <= 10_000):
-        raise InputError(f"`fps` of {label} is {str(fps)[:40]}; write its images per second, such as 30.0.")
+        raise InputError(f"`fps` of {label} is {shown(fps)}; write its images per second, such as 30.0.")
     if not is_number(start) or abs(start) > LONGEST_S:
-        raise InputError(f"`start` of {label} is {str(start)[:40]}; write the seconds at which its first image was taken, such as -1.25.")
+        raise InputError(f"`start` of {label} is {shown(start)}; write the seconds at which its first image was taken, such as -1.25.")
     if not is_number(drift) or abs(drift) > MOST_DRIFT_PPM:
-        raise InputError(f"`drift_ppm` of {label} is {str(drift)[:40]}; write by how many millionths its clock is slow, such as 20.0.")
+        raise InputError(f"`drift_ppm` of {label} is {shown(drift)}; write by how many millionths its clock is slow, such as 20.0.")
     readout = entry.get("readout", 0.0)
     if not is_number(readout) or abs(readout) > LONGEST_READOUT_S:
-        raise InputError(f"`readout` of {label} is {str(readout)[:40]}; write the seconds from its first row to the last, such as 0.016.")
+        raise InputError(f"`readout` of {label} is {shown(readout)}; write the seconds from its first row to the last, such as 0.016.")
     stamps = entry.get("timestamps")
     if stamps is not None and (not isinstance(stamps, str) or Path(stamps).is_absolute() or ".." in Path(stamps).parts):
-        raise InputError(f"`timestamps` of {label} is {str(stamps)[:40]!r}; it must be a file inside the take's folder. Copy it there.")
+        raise InputError(f"`timestamps` of {label} is {shown(stamps)}; it must be a file inside the take's folder. Copy it there.")
     numbers = {"start_s": float(start), "drift_ppm": float(drift), "readout_s": float(readout)}
     return {"fps": None if fps is None else float(fps), "timestamps": stamps, **numbers}
 

@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from ..foundation import bounded
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
 from ..images.sequence import read_image
 
@@ -25,14 +25,14 @@ def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
     if value is None:
         return None
     if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
-        raise InputError(f"`frames` of {where} is {value!r}; write [first, one after the last].")
+        raise InputError(f"`frames` of {where} is {shown(value)}; write [first, one after the last].")
     return value[0], value[1]
 
 
 def inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
     """The path of a file that must lie in the take's folder."""
     if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InputError(f"`{key}` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
+        raise InputError(f"`{key}` of {where} is {shown(name)}; it must be a file inside the take's folder. Copy it there.")
     return folder / name
 
 
@@ -162,11 +162,11 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
             raise InputError(f"A {where} has an unknown key “{key}”.{nearest_name(key, KEYS)}")
     files, view, names = table.get("files"), table.get("view", ""), table.get("names", {})
     if not isinstance(files, str) or Path(files).is_absolute() or ".." in Path(files).parts:
-        raise InputError(f'`files` of a {where} is {files!r}; it must be files inside the take\'s folder, such as "kp/C/*.json".')
+        raise InputError(f'`files` of a {where} is {shown(files)}; it must be files inside the take\'s folder, such as "kp/C/*.json".')
     check_pattern(files, where)
     kind = Path(files).suffix.lower()
     if kind not in PIXELS + SPACE:
-        raise InputError(f"`files` of a {where} is {files!r}; keypoints are read from {', '.join(PIXELS + SPACE)}.")
+        raise InputError(f"`files` of a {where} is {shown(files)}; keypoints are read from {', '.join(PIXELS + SPACE)}.")
     if (kind in PIXELS) != bool(view) or (view and view not in views):
         need = f"must name its view.{nearest_name(str(view), tuple(views))}" if kind in PIXELS else "is in space and has no view."
         raise InputError(f"The {where} with “{files}” {need}")
@@ -174,7 +174,7 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
         raise InputError(f'`names` of a {where} must be a table, such as {{ RKnee = "knee.R" }}.')
     for joint in names.values():
         if joint not in joints:
-            raise InputError(f"A {where} has an unknown joint {joint!r}.{nearest_name(str(joint), tuple(joints))}")
+            raise InputError(f"A {where} has an unknown joint {shown(joint)}.{nearest_name(str(joint), tuple(joints))}")
     offset, sigma, axes = table.get("offset_frames", 0), table.get("sigma", SIGMA_PX if view else SIGMA_M), table.get("axes")
     if not isinstance(offset, int) or not isinstance(sigma, (int, float)) or not 0 < sigma < 1e4 or not isinstance(axes, str | None):
         raise InputError(f"The {where} with “{files}” needs a whole `offset_frames`, a positive `sigma` and a name as `axes`.")

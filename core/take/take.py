@@ -3,7 +3,6 @@
 Joint and view names, and every key, are checked when the file is read; the images are not read.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,8 +12,9 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.arrays import frozen
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
+from ..geometry.rig import MOST_CAMERAS
 from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
 from .clock import KEYS as CLOCK_KEYS
 from .clock import view_clock
@@ -62,8 +62,6 @@ TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY = "none"  # `model` under [body]
-DEVICES = r"^(con|prn|aux|nul|com[1-9¹²³]|lpt[1-9¹²³]) *(\.|$)"  # of Windows, whatever follows the dot
-UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|[. ]$|' + DEVICES, re.IGNORECASE)  # a view's name is used in file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -227,27 +225,27 @@ def take_of_text(text: str, path: Path) -> Take:
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     check_keys(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
-        present = f"it has {table.get('format')!r} and {table.get('version')!r}"
+        present = f"it has {shown(table.get('format'))} and {shown(table.get('version'))}"
         raise InputError(f'{where} must have format = "{FORMAT}" and version = {VERSION}; {present}.')
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)
     reference = table.get("reference_view", names[len(names) // 2])
     if reference not in names:
-        raise InputError(f"`reference_view` of {where} is {reference!r}.{nearest_name(str(reference), names)}")
+        raise InputError(f"`reference_view` of {where} is {shown(reference)}.{nearest_name(str(reference), names)}")
     interlaced = table.get("interlaced", "none")
     if interlaced not in (*INTERLACE, BOTH):
-        raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join((*INTERLACE, BOTH))}.")
+        raise InputError(f"`interlaced` of {where} is {shown(interlaced)}; write one of: {', '.join((*INTERLACE, BOTH))}.")
     first_field = table.get("first_field", "odd")
     if first_field not in ("odd", "even") or ("first_field" in table and interlaced != BOTH):
-        raise InputError(f'`first_field` of {where} is {first_field!r}; write "odd" or "even", and only with interlaced = "both".')
+        raise InputError(f'`first_field` of {where} is {shown(first_field)}; write "odd" or "even", and only with interlaced = "both".')
     fps = table.get("fps")
     if not is_number(fps) or not 0.1 <= float(fps) <= 10_000:
-        raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
+        raise InputError(f"`fps` of {where} is {shown(fps)}; write the frames per second, such as 25.0.")
     body = table_of(table, "body", where)
     check_keys(body, ("model", "locked", "limits"), f"[body] of {where}")
     if not isinstance(body.get("model", ""), str):
         raise InputError(
-            f'`model` under [body] of {where} is {body["model"]!r}; write the name of a body model, such as "arm.R", or "none".'
+            f'`model` under [body] of {where} is {shown(body["model"])}; write the name of a body model, such as "arm.R", or "none".'
         )
     return Take(
         folder=folder,
@@ -275,20 +273,22 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         raise InputError(f"{where} needs at least two [[views]], in the order in which the cameras stand.")
     views = []
     for entry in entries:
-        label = f"view {entry.get('name')!r} of {where}"
+        label = f"view {shown(entry.get('name'))} of {where}"
         check_keys(entry, ("name", "images", "movie", "offset_frames", *CLOCK_KEYS, *PERSON_SOURCES), label)
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"]:
             raise InputError(f'A {label} needs a name (text), such as "L".')
         if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
-            raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
-        if UNFIT_FOR_NAMES.search(entry["name"]):
+            raise InputError(f"`offset_frames` of {label} is {shown(offset)}; write a whole number of frames, such as -2.")
+        if not bounded.fits_file_names(entry["name"]):  # it is used in file names
             raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         check_pattern(entry.get("images"), label)
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
         views.append(View(name=entry["name"], offset_frames=offset, **files, **view_clock(entry, label)))
+    if len(views) > MOST_CAMERAS:
+        raise InputError(f"{where} has {len(views)} views; a take has at most {MOST_CAMERAS}.")
     if len({v.name.casefold() for v in views}) < len(views):
         raise InputError(f"Two views of {where} have the same name, or names that differ only in capitals; give each its own.")
     return tuple(views)
@@ -296,7 +296,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
 
 def _locked(names: Any, where: str) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-        raise InputError(f'`locked` under [body] of {where} is {names!r}; write a list of degrees of freedom, such as ["elbow.R twist"].')
+        raise InputError(f'`locked` under [body] of {where} is {shown(names)}; write a list of names, such as ["elbow.R twist"].')
     return tuple(names)
 
 
@@ -305,7 +305,7 @@ def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
         raise InputError(f'[body.limits] of {where} must be a table, such as "knee.R flexion" = [0, 140].')
     for name, pair in table.items():
         if not isinstance(pair, list) or len(pair) != 2 or not all(is_number(v) for v in pair) or not pair[0] < pair[1]:
-            raise InputError(f"The limits of “{name}” in {where} are {pair!r}; write [lowest, highest] in degrees.")
+            raise InputError(f"The limits of “{name}” in {where} are {shown(pair)}; write [lowest, highest] in degrees.")
     return {name: (float(low), float(high)) for name, (low, high) in table.items()}
 
 
@@ -327,10 +327,10 @@ def _corrections(tables: list[Mapping[str, Any]], views: tuple[str, ...], where:
 def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Correction:
     kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
     if kind not in CORRECTIONS:
-        raise InputError(f"`kind` of {label} is {kind!r}; write one of: {', '.join(CORRECTIONS)}.")
+        raise InputError(f"`kind` of {label} is {shown(kind)}; write one of: {', '.join(CORRECTIONS)}.")
     check_keys(table, ("kind", "view", *CORRECTIONS[kind]), label)
     if view not in views:
-        raise InputError(f"`view` of {label} is {view!r}.{nearest_name(str(view), views)}")
+        raise InputError(f"`view` of {label} is {shown(view)}.{nearest_name(str(view), views)}")
     frame = table.get("frame")
     if kind == "region" and isinstance(table.get("polygon"), list) and len(table["polygon"]) > MOST_SEEDS:
         raise InputError(f"The polygon of {label} has {len(table['polygon'])} corners; {MOST_SEEDS} is the most.")
@@ -366,7 +366,7 @@ def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
     check_keys(at, views, label)
     for view, xy in at.items():
         if not is_pixel(xy):
-            raise InputError(f"The {label} in view {view} is {xy!r}; write two pixel coordinates [x, y].")
+            raise InputError(f"The {label} in view {view} is {shown(xy)}; write two pixel coordinates [x, y].")
     return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
 
 

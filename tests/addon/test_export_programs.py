@@ -189,6 +189,13 @@ def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun,
     assert {key: named_for(key[0], Path(key[1]), tmp_path).name for key in named} == named
     with pytest.raises(InputError, match="a.fbx has the ending of another format; let it end in .trc"):
         named_for("trc", Path("a.fbx"), tmp_path)
+    for slip in ("0000.png", "take.toml", "film.MP4", "body.blend"):
+        with pytest.raises(InputError, match="has the ending of another format; let it end in .csv"):
+            named_for("csv", Path(slip), tmp_path)
+    (tmp_path / "take.toml").write_text("")
+    for kind, name in (("ply", "take.toml"), ("bvh", "take.toml/a.bvh")):
+        with pytest.raises(InputError, match="belongs to the take"):
+            named_for(kind, tmp_path / name, None)
     file, out = tmp_path / "moved", str(small_run.out)
     assert blender.ops.tricap.export(kind="bvh", out=out, filepath=str(file)) == {"FINISHED"} and file.with_suffix(".bvh").is_file()
     with pytest.raises(RuntimeError, match="another format"):

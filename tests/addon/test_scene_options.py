@@ -165,10 +165,14 @@ def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: 
     v = len(made.vertices_m)
     write_skin(small_run.out / "skin" / REST, replace(made, relief_m=np.zeros(v), sigma_m=np.full(v, 0.003)))
     assert cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), 99, np.uint8))
-    (out / "textures" / "texture.png").symlink_to(elsewhere / "mine.png")
+    (out / "textures" / "a.usd_1.png").symlink_to(elsewhere / "mine.png")
     export_file(small_run.out, "usd", out / "a.usd", "plain", Monitor())
-    assert (out / "textures" / "texture.png").read_bytes().startswith(b"\x89PNG") and (elsewhere / "mine.png").read_text() == "mine"
+    assert (out / "textures" / "a.usd_1.png").read_bytes().startswith(b"\x89PNG") and (elsewhere / "mine.png").read_text() == "mine"
     assert sorted(path.name for path in out.iterdir()) == ["a.usd", "textures"]
+    first = (out / "textures" / "a.usd_1.png").read_bytes()
+    assert cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), 200, np.uint8))
+    export_file(small_run.out, "usd", out / "b.usd", "plain", Monitor())
+    assert (out / "textures" / "a.usd_1.png").read_bytes() == first != (out / "textures" / "b.usd_1.png").read_bytes()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "textures").symlink_to(elsewhere)
     with pytest.raises(InputError, match="textures is a link to a place outside"):

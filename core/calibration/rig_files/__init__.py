@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...foundation.errors import InputError
-from ...geometry.rig import Rig
+from ...geometry.rig import Rig, check_cameras
 from . import agisoft, colmap, opencv_files, openptv, toml_files
 from .reading import text_of
 
@@ -26,16 +26,13 @@ def read_any(path: Path) -> Rig:
     """Read another tool's calibration, whose kind follows from the file or folder.
 
     Raises:
-        InputError: it is missing, of no known kind, or damaged, or two of its cameras have one name.
+        InputError: it is missing, of no known kind, or damaged, or its cameras are too many or have no names of their own.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"The calibration {path} is missing; check the path.")
     rig = _read(path)
-    names = [camera.name for camera in rig.cameras]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"{path} names two cameras “{twice}”; give each its own name there.")
+    check_cameras(rig.cameras, str(path))
     return rig
 
 
@@ -66,6 +63,7 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
         raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
     if name in FOLDERS and Path(path).is_file():
         raise InputError(f"{path} is a file; {name} needs a folder.")
+    check_cameras(rig.cameras, "The rig")
     curved = [camera.name for camera in rig.cameras if camera.fisheye]
     if curved and name not in WITH_FISHEYE:
         raise InputError(f"{name} has no fisheye lens, as camera {curved[0]} has; choose one of {', '.join(WITH_FISHEYE)}.")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera, camera_of, exterior_derivatives, image_with_derivatives
 from ...geometry.rig import Rig
@@ -121,8 +121,12 @@ def write(folder: Path, rig: Rig) -> list[Path]:
     """Write NAME.ori, NAME.addpar of every camera and ptv.par into a folder.
 
     Raises:
-        InputError: the cameras have different sizes, which ptv.par cannot say.
+        InputError: the cameras have different sizes, which ptv.par cannot say, or a name that no file may have.
     """
+    names = [camera.name.casefold() for camera in rig.cameras]
+    unfit = next((c.name for c in rig.cameras if not bounded.fits_file_names(c.name) or names.count(c.name.casefold()) > 1), None)
+    if unfit is not None:
+        raise InputError(f"OpenPTV's files are named after the cameras, and “{unfit}” is no name of a file of its own; rename that camera.")
     sizes = {camera.size_px for camera in rig.cameras}
     if len(sizes) > 1:
         raise InputError("OpenPTV needs cameras of one image size; export them one by one.")
@@ -138,8 +142,8 @@ def write(folder: Path, rig: Rig) -> list[Path]:
         store.write_text(paths[-2], "\n".join(lines) + "\n")
         store.write_text(paths[-1], " ".join(repr(float(v)) for v in p[3:]) + "\n")
     w, h = rig.cameras[0].size_px
-    names = [line for camera in rig.cameras for line in (f"img/{camera.name}.", f"cal/{camera.name}")]
-    par = [len(rig.cameras), *names, 1, 0, 1, w, h, PIXEL_MM, PIXEL_MM, 0, 1.0, 1.0, 1.0, 0.0]
+    entries = [line for camera in rig.cameras for line in (f"img/{camera.name}.", f"cal/{camera.name}")]
+    par = [len(rig.cameras), *entries, 1, 0, 1, w, h, PIXEL_MM, PIXEL_MM, 0, 1.0, 1.0, 1.0, 0.0]
     paths.append(folder / "ptv.par")
     store.write_text(paths[-1], "\n".join(map(str, par)) + "\n")
     return paths

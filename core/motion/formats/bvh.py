@@ -13,6 +13,7 @@ import numpy as np
 from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.rotation import about, euler_from_matrix, shortest, unit
+from ..plausible import check_places
 from ..retarget.rig import Motion, Rig
 
 DEEPEST = 256  # joints in a chain: a tail or a braid has some dozens
@@ -81,6 +82,7 @@ def _joints(text: str, path: Path) -> list[_Joint]:
             stack.append(-1)
         elif kind == "OFFSET":
             offset = np.array([_number(next(words, ""), path) for _ in range(3)])
+            check_places(offset, f"{path} is a motion")
             _set_offset(joints, stack, offset, path)
         elif kind == "CHANNELS":
             count = int(_number(next(words, ""), path))
@@ -150,6 +152,7 @@ def _values(body: str, columns: int, path: Path) -> tuple[np.ndarray, float]:
     table = values[: frames * columns].reshape(frames, columns)
     if not np.isfinite(table).all():
         raise InputError(f"{path} holds values that are no finite numbers; export it again.")
+    check_places(table, f"{path} is a motion")
     return table, 1.0 / frame_time
 
 

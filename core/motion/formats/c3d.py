@@ -21,6 +21,7 @@ import numpy as np
 
 from ...foundation import bounded, store
 from ...foundation.errors import InputError
+from ..plausible import check_places
 from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
 BLOCK = 512
@@ -258,6 +259,7 @@ def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
     rows = np.frombuffer(data, np.uint8, t * stride, begin).reshape(t, stride)[:, : size * 4 * n].tobytes()
     raw = (number.floats(rows) if scale < 0 else np.frombuffer(rows, f"{number.order}i2")).astype(np.float64).reshape(t, n, 4)
     per_unit = metres_per(unit or table.get(("POINT", "UNITS"), "mm") or "mm", path)
+    check_places(raw[..., :3], f"{path} is a file")
     xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * per_unit
     known = (raw[..., 3] >= 0) & np.isfinite(xyz).all(axis=2)
     residual = np.clip(np.nan_to_num(raw[..., 3]), 0, MOST_WORD).astype(np.int64) & 0xFF

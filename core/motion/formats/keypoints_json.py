@@ -15,7 +15,7 @@ import numpy as np
 
 from ...foundation import bounded
 from ...foundation.arrays import check_sparse, frozen
-from ...foundation.errors import InputError
+from ...foundation.errors import InputError, shown
 from ...geometry.robust import finite_median
 
 COCO = (
@@ -168,7 +168,7 @@ def _json(path: Path) -> Any:
 def _name(value: Any, path: Path) -> Any:
     """The name or number of an image."""
     if not isinstance(value, (str, int, float)) and value is not None:
-        raise InputError(f"{path} has an image named {str(value)[:40]}; give OpenPose's or COCO's JSON.")
+        raise InputError(f"{path} has an image named {shown(value)}; give OpenPose's or COCO's JSON.")
     return value
 
 

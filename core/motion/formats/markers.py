@@ -19,6 +19,7 @@ from ...foundation import bounded, store
 from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
 from ...images.interlace import frame_time_s
+from ..plausible import check_places, check_times
 from ..tables import read_joints
 
 AXES = {
@@ -49,8 +50,8 @@ class Markers:
         object.__setattr__(self, "sigma_m", frozen(self.sigma_m, (t, n), float, "sigma_m"))
         if t == 0 or n == 0:
             raise InputError("There are no points in any frame; choose a file with points.")
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise InputError(f"The points have {self.fps} frames per second; that must be a positive number.")
+        check_times(self.frames, self.fps, "There are points")
+        check_places(self.xyz_m, "There are points")
 
 
 def metres_per(unit: str, where: object) -> float:
@@ -157,7 +158,7 @@ def _read(path: Path) -> Markers:
         if not names:
             raise InputError(f"The table {path} has no rows; choose one with points.")
         xyz, sigma = (np.stack([column[name] for name in names], axis=1) for column in (table.joints_m, table.sigma_m))
-        return Markers(names=names, fps=rate(frames, table.time_s), frames=frames, xyz_m=xyz, sigma_m=sigma)
+        return Markers(names=names, fps=rate(frames, table.time_s, path), frames=frames, xyz_m=xyz, sigma_m=sigma)
     return _wide(path, header, text)
 
 
@@ -177,17 +178,24 @@ def _wide(path: Path, header: list[str], rows: io.StringIO) -> Markers:
         raise InputError(f"{path} has no rows that fit its header; export it again.")
     check_size(table.shape, table.size, path)
     frames = table[:, header.index("frame")]
-    if not np.isfinite(frames).all():
-        raise InputError(f"{path} has rows without a frame number; export it again.")
+    check_times(frames, DEFAULT_FPS, f"{path} has rows")
     xyz = np.stack([table[:, [places[axis] for axis in "xyz"]] for places in columns.values()], axis=1)
     time = table[:, header.index("time_s")] if "time_s" in header else frames / DEFAULT_FPS
-    return Markers(names=tuple(columns), fps=rate(frames, time), frames=frames, xyz_m=xyz, sigma_m=np.full(xyz.shape[:2], np.nan))
+    return Markers(names=tuple(columns), fps=rate(frames, time, path), frames=frames, xyz_m=xyz, sigma_m=np.full(xyz.shape[:2], np.nan))
 
 
-def rate(frames: np.ndarray, time_s: np.ndarray) -> float:
-    """Frames per second of a table with frame numbers and times."""
+def rate(frames: np.ndarray, time_s: np.ndarray, where: object) -> float:
+    """Frames per second of a table with frame numbers and times.
+
+    Raises:
+        InputError: the times do not increase.
+    """
     if len(frames) < 2:
         return DEFAULT_FPS
-    steps = np.diff(time_s) / np.maximum(np.diff(frames), 1)
-    step = float(np.median(steps))
-    return 1.0 / step if np.isfinite(step) and step > 0 else DEFAULT_FPS
+    between = np.diff(time_s)
+    if not (between > 0).all():
+        row = int(np.flatnonzero(~(between > 0))[0])
+        raise InputError(
+            f"{where} has the time {time_s[row + 1]:g} s after {time_s[row]:g} s; times must increase. Correct or remove them."
+        )
+    return 1.0 / float(np.median(between / np.maximum(np.diff(frames), 1)))

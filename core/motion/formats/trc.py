@@ -7,6 +7,7 @@ import numpy as np
 from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...images.interlace import frame_time_s
+from ..plausible import check_places, check_times
 from .markers import Markers, axes_of, check_size, metres_per
 
 HEADINGS = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
@@ -57,9 +58,11 @@ def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
     rows = [line.split("\t") for line in lines[5:] if line.strip()]
     if len(rows) < t:
         raise InputError(f"{path} promises {t} frames and holds {len(rows)}; export it again.")
-    table = np.array([_row(row, n, path) for row in rows[:t]])
+    fps, table = _rate(header["DataRate"], path), np.array([_row(row, n, path) for row in rows[:t]])
+    check_times(table[:, 0], fps, f"{path} is a file")
+    check_places(table[:, 1:], f"{path} is a file")
     xyz = table[:, 1:].reshape(t, n, 3) * metres_per(unit or header["Units"], path) @ rotation
-    return Markers(names=tuple(names), fps=_rate(header["DataRate"], path), frames=table[:, 0], xyz_m=xyz, sigma_m=np.full((t, n), np.nan))
+    return Markers(names=tuple(names), fps=fps, frames=table[:, 0], xyz_m=xyz, sigma_m=np.full((t, n), np.nan))
 
 
 def _lines(path: Path) -> list[str]:

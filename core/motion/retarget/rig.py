@@ -30,6 +30,7 @@ from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
 from ...geometry.rotation import between, transposed
 from ...images.interlace import frame_time_s
+from ..plausible import check_places, check_span, check_times
 from .residual_motion import ResidualMotion
 
 
@@ -131,8 +132,9 @@ class Motion:
             raise InputError("The motion has no frames; choose one with frames.")
         if not (np.isfinite(self.R).all() and np.isfinite(self.head_m).all()):
             raise InputError("The motion has positions or rotations that are not numbers; fill its gaps first.")
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise InputError(f"The motion has {self.fps} frames per second; that must be a positive number.")
+        check_times(self.frames, self.fps, "There is a motion")
+        check_places(self.head_m, "There is a motion")
+        check_span(self.frames[0], self.frames[-1], t, "There is a motion")
 
 
 def posed(rig: Rig, basis: np.ndarray, shift_m: Mapping[int, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:

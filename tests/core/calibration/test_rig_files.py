@@ -1,5 +1,6 @@
 """Other tools' files: what is written is read again; files as those tools write them are understood; broken ones are refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -230,6 +231,28 @@ def test_openptv_file(tmp_path: Path) -> None:
     inside = camera.sees(expected)
     assert inside.sum() > 50
     assert np.linalg.norm(camera.project(X / 1000) - expected, axis=1)[inside].max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["{other}/L", "../L", "a/L", "..", "a\\L", "con", "L:", "c"])
+def test_no_camera_leads_the_files_of_openptv_elsewhere(tmp_path: Path, name: str) -> None:
+    """An absolute name, or one with “..”, wrote outside of the folder; on Windows and macOS “c” and “C” are one file."""
+    other, out = tmp_path / "other", tmp_path / "new" / "out"
+    other.mkdir()
+    left, *more = benchmark_cameras()
+    rig = Rig(cameras=(replace(left, name=name.format(other=other)), *more))
+    with pytest.raises(InputError, match="is no name of a file of its own"):
+        write_as(out, rig, "openptv")
+    assert list(tmp_path.iterdir()) == [other] and not list(other.iterdir())
+
+
+@pytest.mark.parametrize("kind", sorted(FORMATS))
+@pytest.mark.parametrize("name", ["", "L\n2 1 0 0", "L\x1b[2J"])
+def test_a_name_of_several_lines_is_written_nowhere(tmp_path: Path, kind: str, name: str) -> None:
+    """It would be lines of its own in COLMAP's file."""
+    left, *more = benchmark_cameras()
+    with pytest.raises(InputError, match="give it a name in one line"):
+        write_as(target(tmp_path, kind), Rig(cameras=(replace(left, name=name), *more)), kind)
+    assert not list(tmp_path.iterdir())
 
 
 def test_openptv_cameras_that_look_into_water_are_refused(shared_takes: Path) -> None:

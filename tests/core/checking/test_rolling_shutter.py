@@ -86,7 +86,7 @@ def rms(difference: np.ndarray) -> float:
 @pytest.mark.parametrize("readout", ["true", "2.0", "nan", '"x"'])
 def test_an_impossible_readout_is_refused(tmp_path: Path, readout: str) -> None:
     write_take_toml(tmp_path, ["L", "R"], more=f"readout = {readout}")
-    with pytest.raises(InputError, match="`readout` of view 'R' .* write the seconds from its first row to the last"):
+    with pytest.raises(InputError, match='`readout` of view "R" .* write the seconds from its first row to the last'):
         read_take(tmp_path)
 
 

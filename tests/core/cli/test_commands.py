@@ -61,7 +61,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "rig lacks a view": (lambda t: edit(t, 'name = "R"', 'name = "X"', "rig.toml"), "The rig has no camera “R”"),
     "rig with NaN": (lambda t: edit(t, "translation = [", "translation = [nan, 1.0, 2.0] # ", "rig.toml"), "must be 3 finite numbers"),
     "unknown key": (lambda t: edit(t, "fps", "fqs"), "unknown key “fqs”. Did you mean “fps”?"),
-    "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), "version = 1; it has 'tricap-take' and 7"),
+    "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), 'version = 1; it has "tricap-take" and 7'),
     "a folder for a pattern": (lambda t: edit(t, "L/*.png", "L"), "“L” is a folder; write “L/*.png”"),
     "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), "`offset_frames` of view 'L' of"),
     "offset in parts": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = 1.5\n'), "is 1.5; write a whole number"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tricap.core.cli.main import _progress_line
+from tricap.core.cli.streams import write_line
 from tricap.core.foundation.errors import InputError, sentence_of
 from tricap.core.foundation.progress import Monitor
 
@@ -48,10 +49,14 @@ def test_every_line_ends_with_the_code_of_what_was_found(rig: Path) -> None:
     assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr, done.stderr
 
 
-def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path) -> None:
-    done = shell("tricap check RIG > /dev/full", rig)
+@pytest.mark.parametrize("arguments", ["check RIG", "check RIG --json", "--help", "run --help"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path, arguments: str, unbuffered: str) -> None:
+    done = shell(f"tricap {arguments} > /dev/full; exit $?", rig, PYTHONUNBUFFERED=unbuffered)
     assert done.returncode == 2 and done.stderr.decode().startswith("tricap: Cannot write the output of this command: No space"), done
     assert done.stderr.count(b"\n") == 1
+    assert b"required: COMMAND" in shell("tricap > /dev/full", rig).stderr.splitlines()[-1]  # nothing was to be written there
+    assert shell("tricap --help | head -c 0; exit ${PIPESTATUS[0]}", rig).returncode == 0
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
@@ -61,6 +66,16 @@ def test_every_encoding_takes_every_character(rig: Path, encoding: str) -> None:
     assert plain.returncode == 1 and b"Traceback" not in plain.stderr, plain
     found = json.loads(text[text.index("{") :])
     assert "é“\U0001f600" in str(found), text
+
+
+def test_what_names_would_do_to_a_terminal_is_shown_instead(capfd: pytest.CaptureFixture[str]) -> None:
+    """Escape sequences, and marks that turn the direction of writing; JSON stays what it was."""
+    evil = "a\x1b]0;pwn\x07\x9b31m\u202eé\u200d\U0001f600\ttab\x7f"
+    for line in (f"{evil}\nsecond", json.dumps({"a": evil}, ensure_ascii=False)):
+        write_line(line, sys.stdout)
+    shown = capfd.readouterr().out
+    assert shown.startswith("a\\u001b]0;pwn\\u0007\\u009b31m\\u202eé\u200d\U0001f600\ttab\\u007f\nsecond\n{")
+    assert json.loads(shown.splitlines()[-1]) == {"a": evil}
 
 
 def test_a_progress_bar_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

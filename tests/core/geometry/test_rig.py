@@ -33,7 +33,7 @@ def read(folder: Path, content: str) -> Rig:
 def some_rig() -> Rig:
     random = np.random.default_rng(5)
     cameras = []
-    for name in ("L", "centre é", 'a "quoted" \\ name\nin two lines\x7f'):
+    for name in ("L", "centre é", 'a "quoted" \\ name é 😀'):
         f, cx, cy, skew = 1500 + random.uniform(), 380 + random.uniform(), 290 + random.uniform(), random.uniform()
         cameras.append(
             Camera(name=name, size_px=(768, 576), matrix=np.array([[f, skew, cx], [0, f + 1, cy], [0, 0, 1]]),
@@ -80,11 +80,14 @@ def test_views_are_found_by_name(tmp_path: Path) -> None:
 FAULTS = {
     "not TOML": ("[cam_0\n", "is not a TOML file"),
     "no cameras": ("[metadata]\nunit = 'm'\n", "has no cameras"),
-    "unknown unit": (text({}, metadata='[metadata]\nunit = "inch"'), "unknown unit 'inch'"),
+    "unknown unit": (text({}, metadata='[metadata]\nunit = "inch"'), 'unknown unit "inch"'),
     "unit is a list": (text({}, metadata="[metadata]\nunit = [1]"), "unknown unit"),
     "metadata is a number": ("metadata = 3\n" + text({}), "unknown unit"),
     "camera is a number": ("cam_0 = 3\n", "is not a table"),
-    "two alike": (text({}, {}), "has two cameras of the same name \\(L, L\\)"),
+    "two alike": (text({}, {}), "has two cameras of the name “L”"),
+    "a name of two lines": (text({"name": '"L\\nR"'}), 'a camera of the name "L\\\\nR"; give it a name in one line'),
+    "no name": (text({"name": '" "'}), 'a camera of the name " "'),
+    "very many": (text(*({"name": f'"{n}"'} for n in range(201))), "has 201 cameras; a rig has at most 200"),
     "lacks size": (text({"size": None}), "Camera “L” of the rig .*lacks “size”"),
     "lacks matrix": (text({"matrix": None}), "lacks “matrix”"),
     "lacks rotation": (text({"rotation": None}), "lacks “rotation”"),

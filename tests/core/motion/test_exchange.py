@@ -95,7 +95,7 @@ def test_a_sigma_in_c3d_is_known_or_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize("frames", [(3, 2), (0, 1 << 40)], ids=str)
 def test_frames_that_c3d_cannot_number_are_said(tmp_path: Path, frames: tuple[int, int]) -> None:
     xyz = np.zeros((2, 1, 3))
-    with pytest.raises(InputError, match="correct the frame numbers"):
+    with pytest.raises(InputError, match="frame numbers"):
         write_c3d(tmp_path / "a.c3d", Markers(names=("a",), fps=50.0, frames=frames, xyz_m=xyz, sigma_m=xyz[..., 0]))
 
 

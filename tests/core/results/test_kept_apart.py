@@ -1,5 +1,6 @@
 """What is read is never written over: results go into no take and no footage, and no command writes the file that it reads."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -8,8 +9,10 @@ import pytest
 
 from tricap.core.calibration.rig_files import write_as
 from tricap.core.cli import main
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rig import read_rig
 from tricap.core.results.folder import check_separate_folder
+from tricap.core.results.outputs import check_output
 
 Capture = pytest.CaptureFixture[str]
 LINKS = pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
@@ -118,3 +121,51 @@ def test_a_wrong_argument_takes_nothing_away(take: Path, tmp_path: Path, capfd: 
                        (["contour", "--view", "X"], "has no view “X”")):  # fmt: skip
         assert said in refused([argv[0], str(take), *argv[1:], "--out", str(out), "--quiet"], capfd)
         assert names(out) == before
+
+
+OUTPUTS = {
+    "take.toml": ["calibrate", "--import", "{rig}", "--out", "{take}/take.toml"],
+    "an image": ["calibrate", "--board", "charuco", "--squares", "7x5", "--square", "0.04", "--print", "{take}/L/0002.png"],
+    "through a link": ["calibrate", "--board", "charuco", "--squares", "7x5", "--square", "0.04", "--print", "{link}/0002.png"],
+    "the footage": ["calibrate", "--import", "{rig}", "--export", "openptv", "--out", "{take}/L"],
+    "the images that are tracked": ["track2d", "{frames}", "--points", "{points}", "--out", "{frames}/0001.png"],
+    "the pictures": ["track2d", "{frames}", "--points", "{points}", "--out", "{new}", "--pictures", "{take}/C"],
+    "its own input": ["calibrate", "--import", "{rig}", "--out", "{rig}"],
+    "another input": ["calibrate", "--import", "{take}/rig.toml", "--like", "{rig}", "--out", "{rig}"],
+    "a plot": ["fields", "--out", "{take}/take.toml"],
+    "the time stamps": ["fields", "--out", "{take}/stamps.csv"],
+    "the sound": ["fields", "--out", "{take}/L.wav"],
+}  # fmt: skip
+
+
+@LINKS
+@pytest.mark.parametrize("what", OUTPUTS)
+def test_no_file_that_is_written_is_an_input_or_part_of_a_take(take: Path, tmp_path: Path, capfd: Capture, what: str) -> None:
+    shutil.copytree(take / "L", tmp_path / "frames")
+    shutil.copy(take / "rig.toml", tmp_path / "rig.toml")
+    (tmp_path / "points.csv").write_text("point,x,y\na,60,60\n")
+    (tmp_path / "link").symlink_to(take / "L")
+    text = (take / "take.toml").read_text(encoding="utf-8")
+    (take / "take.toml").write_text(text.replace("[[views]]", '[[views]]\ntimestamps = "stamps.csv"', 1), encoding="utf-8")
+    files = {name: tmp_path / name for name in ("frames", "link", "new")}
+    files |= {"take": take, "rig": tmp_path / "rig.toml", "points": tmp_path / "points.csv"}
+    before = names(tmp_path)
+    said = refused([word.format(**files) for word in OUTPUTS[what]], capfd)
+    assert ("is also an input" in said or "belongs to the take" in said) and names(tmp_path) == before, said
+
+
+def test_the_take_of_a_run_is_kept_apart_and_its_rig_may_be_replaced(take: Path, tmp_path: Path) -> None:
+    """The footage may lie elsewhere: then only the run, or the take, names it."""
+    (take / "L").rename(tmp_path / "films")
+    (take / "L").symlink_to(tmp_path / "films")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text(json.dumps({"take": str(take)}))
+    for file in (tmp_path / "films" / "0000.png", take / "rig.toml"):
+        with pytest.raises(InputError, match="belongs to the take"):
+            check_output(file, [tmp_path / "out"])
+    check_output(take / "rig.toml", may_be_rig=True)
+    for file in (tmp_path / "out" / "new.png", take / "results" / "a.csv", take / "new.csv"):
+        check_output(file, [tmp_path / "out"])
+    (take / "take.toml").write_text("damaged")
+    with pytest.raises(InputError, match="belongs to the take"):
+        check_output(take / "take.toml")

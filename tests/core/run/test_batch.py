@@ -163,10 +163,40 @@ def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, m
 
 def test_names_of_results(tmp_path: Path) -> None:
     a, b, c = tmp_path / "monday" / "kick", tmp_path / "tuesday" / "kick", tmp_path / "throw"
-    assert [p.name for p in out_folders([a, b, c], tmp_path)] == ["monday_kick", "tuesday_kick", "throw"]
-    assert [p.name for p in out_folders([a, tmp_path / "tuesday" / "Kick"], tmp_path)] == ["monday_kick", "tuesday_Kick"]  # macOS, Windows
-    with pytest.raises(InputError, match="is listed twice"):
-        out_folders([a, a], tmp_path)
+    assert [p.name for p in out_folders([a, b, c], tmp_path)[0]] == ["monday_kick", "tuesday_kick", "throw"]
+    outs, refused = out_folders([a, tmp_path / "tuesday" / "Kick"], tmp_path)  # one name on macOS and Windows
+    assert [p.name for p in outs] == ["monday_kick", "tuesday_Kick"] and not refused
+    _, refused = out_folders([a, c, a], tmp_path)
+    assert list(refused) == [2] and "is listed twice" in refused[2]
+    c.mkdir()
+    (c / "take.toml").touch()
+    with pytest.raises(InputError, match="is itself a take"):
+        out_folders([a], c)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_take_whose_results_have_no_place_stops_no_other(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folder is a link out of the results, a take, or the one of another take; a file in its place is the worker's to report."""
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(pipeline, "all_stages", lambda job, monitor: None)
+    monkeypatch.setattr(batch, "_scene", lambda job: None)
+    takes += [Path(shutil.copytree(takes[0], takes[0].with_name(name))) for name in ("a take", "file")]
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    shutil.copytree(takes[0], out / "a take")
+    (out / "file").touch()
+    elsewhere.mkdir()
+    (out / takes[0].name).symlink_to(elsewhere)
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        engine = Engine(scheduler=cluster.scheduler_address)
+        outcomes = run_batch([*takes, takes[2]], out, engine, COARSE, Monitor())
+    bad = Status.INVALID_INPUT
+    assert [o.status for o in outcomes] == [bad, bad, Status.DONE, bad, bad, bad], outcomes
+    for n, said in {0: "is a link to a place outside", 3: "is itself a take", 4: "file", 5: "is listed twice"}.items():
+        assert said in outcomes[n].said
+    told = json.loads((out / "batch.json").read_text())["takes"]
+    assert [t["status"] for t in told] == [o.status for o in outcomes]
+    assert not list(elsewhere.iterdir()) and [p.name for p in (out / "a take").iterdir()] == [p.name for p in takes[0].iterdir()]
 
 
 def test_the_summary() -> None:

@@ -66,7 +66,7 @@ def test_time_stamps_that_cannot_be_used_are_refused_in_one_sentence(sixty: Path
 def test_impossible_clocks_are_refused(tmp_path: Path, line: str) -> None:
     views = "".join(f'[[views]]\nname = "{n}"\nimages = "{n}/*.png"\n' for n in "LR")
     (tmp_path / "take.toml").write_text(HEAD + views + line + "\n")
-    with pytest.raises(InputError, match=f"`{line.split()[0]}` of view 'R'"):
+    with pytest.raises(InputError, match=f'`{line.split()[0]}` of view "R"'):
         read_take(tmp_path)
 
 
