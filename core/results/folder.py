@@ -21,7 +21,7 @@ from .run_json import FORMAT, VERSION
 RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
     "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4",
-    "body.blend",
+    "scene.mp4", "body.blend",
 )  # fmt: skip
 
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
