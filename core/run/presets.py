@@ -56,6 +56,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "use_trajectories": False,
             "closed_loop": "off",
             "use_background": False,
+            "search_limbs": False,
             "complete_surface": False,
             "place_joints": "off",
         },
