@@ -16,6 +16,9 @@ from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
 from .retarget import command as retargeting
 
+FROM_DEG, TURN_DEG, ELEVATION_DEG = -45.0, 90.0, 12.0  # of the film of a scene: from one side of the cameras to the other
+MOST_DEG = {"from": 360.0, "turn": 36_000.0, "elevation": 85.0}  # either way
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command of the `tricap` command line, of the core's or of those that need Blender; its exit code (docs/formats.md)."""
@@ -34,9 +37,17 @@ def add_commands(subparsers: Any) -> None:
     about = "a Blender file with armature, action, skins, cameras, footage, cloud and trajectories"
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")
-    parser.add_argument("--blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
+    parser.add_argument("--blend", metavar="FILE.blend", type=Path, help="the file to write")
     parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also write a picture: the body shaded, and over the footage")
     parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also write a turntable movie of the body")
+    parser.add_argument("--film", metavar="FILE.mp4", type=Path, help="also write a movie of every frame, from a camera of its own")
+    degrees = (
+        ("--from", "start_deg", FROM_DEG, "where the film's camera begins: degrees around the person, from the middle camera to its right"),
+        ("--turn", "turn_deg", TURN_DEG, "degrees by which it circles around the person until the last frame"),
+        ("--elevation", "elevation_deg", ELEVATION_DEG, "degrees by which it stands above the person"),
+    )
+    for flag, name, usual, what in degrees:
+        parser.add_argument(flag, dest=name, metavar="DEG", type=float, default=usual, help=f"{what} (default {usual:g})")
     parser.add_argument(
         "--frame", metavar="N", type=int, help="the frame of preview, turntable and implicit surface (default: the middle one)"
     )
@@ -73,7 +84,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Build the scene of args.out in an empty file and save it as args.blend; the lines to show.
+    """Build the scene of args.out in an empty file, save it as args.blend, and make pictures and movies of it; the lines to show.
 
     Raises:
         InputError: there is no Blender in this Python, or the input is invalid.
@@ -89,7 +100,8 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         from .scene.build import SceneOptions, write_scene
         from .scene.cameras import look_through
         from .scene.contents import read_contents
-        from .scene.preview import preview, turntable
+        from .scene.movies import film, turntable
+        from .scene.preview import preview
 
         _check(args)
         contents = read_contents(args.out, monitor, skins=args.exact_skin, removed=args.removed)
@@ -114,7 +126,10 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
             preview(contents, args.preview, args.frame)
         if args.turntable is not None:
             turntable(args.turntable, args.frame, monitor)
-    return [*report.warnings, f"{args.blend}: {report}", *(str(path) for path in (args.preview, args.turntable) if path is not None)]
+        if args.film is not None:
+            film(args.film, monitor, start_deg=args.start_deg, turn_deg=args.turn_deg, elevation_deg=args.elevation_deg)
+    written = [str(path) for path in (args.preview, args.turntable, args.film) if path is not None]
+    return [*report.warnings, *([f"{args.blend}: {report}"] if args.blend is not None else []), *written]
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -124,7 +139,13 @@ def _check(args: argparse.Namespace) -> None:
         InputError: one of them is invalid.
     """
     check_simplify(args.simplify)
-    named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), ("--turntable", args.turntable, ".mp4"))
+    for name, value in (("from", args.start_deg), ("turn", args.turn_deg), ("elevation", args.elevation_deg)):
+        if not abs(value) <= MOST_DEG[name]:  # nor NaN
+            raise InputError(f"--{name} {value:g} is out of range; choose an angle of {-MOST_DEG[name]:g} to {MOST_DEG[name]:g} degrees.")
+    movies = ("--turntable", args.turntable, ".mp4"), ("--film", args.film, ".mp4")
+    named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), *movies)
+    if all(path is None for _, path, _ in named):
+        raise InputError("Nothing to write: give --blend FILE.blend, --preview FILE.png, --turntable FILE.mp4 or --film FILE.mp4.")
     for flag, path, ending in named:
         if path is not None:
             bounded.check_name(bounded.real_path(path.parent) / path.name)

@@ -113,7 +113,11 @@ def _stages(commands: Any) -> None:
     where.add_argument("--workers", type=int, metavar="N", help="processes that measure frames at once (default: one for every core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, such as tcp://farm:8786, whose workers measure frames")
     everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
-    everything.add_argument("--film", action="store_true", help="also write film.mp4: the body over every frame of every view")
+    everything.add_argument(
+        "--film",
+        action="store_true",
+        help="also write film.mp4, the body over every frame of every view, and scene.mp4, from a camera of its own",
+    )
     demo = _command(
         commands, "demo", "make a synthetic recording, run all stages on it, and compare with the truth", action("stages", "demo")
     )

@@ -75,8 +75,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
             job.engine = engine
             pipeline.all_stages(job, monitor)
             lines = _build_scene(job, args, monitor)
-        if args.film and not job.results.path("film.mp4").is_file():
-            lines.append(f"Film: {write_film(job.footage, job.results, monitor)}")
+        if args.film:
+            lines += _films(job, args, monitor)
         return _summary(job, args.json) + ([] if args.json else lines)
 
 
@@ -130,6 +130,17 @@ def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor)
         job.warn(f"No body.blend was written: {error}")
         job.results.write_run(job.record)
     return []
+
+
+def _films(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Write the films that are missing: over every frame of every view, and where Blender is available, of the scene."""
+    lines, scene = [], job.results.path("scene.mp4")
+    if not job.results.path("film.mp4").is_file():
+        lines.append(f"Film: {write_film(job.footage, job.results, monitor)}")
+    if "scene" in _names_of(given.parser) and importlib.util.find_spec("bpy") is not None and not scene.is_file():
+        args = given.parser.parse_args(["scene", str(job.results.folder), "--film", str(scene), *(["--quiet"] if given.quiet else [])])
+        lines += [f"Film of the scene: {str(args.run(args, monitor)[-1])}"]
+    return lines
 
 
 def _summary(job: take_run.Run, as_json: bool) -> list[str]:

@@ -51,6 +51,11 @@ class FitSettings:
         "trajectories and body predict (outlines); or fit once (off). auto: what is most accurate for its cost, at present off.",
         choices=("auto", "off", "tracks", "outlines"),
     )
+    search_limbs: bool = knob(
+        True,
+        "Limbs that lost their points, or leave what is seen near them unexplained, are searched for all over the joints' range; without, "
+        "each frame starts from its prediction alone, as published.",
+    )
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
     shared_frames: float = knob(
         1.0,

@@ -13,10 +13,13 @@ STYLE = """
 background:var(--paper)}h1{margin:.2em 0}h2{margin:1.6em 0 .5em}img,svg{max-width:100%;height:auto}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{display:grid;gap:1em;
 grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.cells{gap:.4em;
-grid-template-columns:repeat(auto-fit,minmax(150px,1fr))}.graphs{
+grid-template-columns:repeat(auto-fit,minmax(min(45%,240px),1fr))}.graphs{
 grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}.wide{overflow-x:auto}
 .single{grid-template-columns:1fr}.broad{grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}
-figure img{width:100%}svg.strip{min-width:640px}
+figure img{width:100%}.strip{display:grid;grid-template-columns:max-content 1fr;gap:4px .8em;font-size:13px;line-height:18px}
+.strip>span{text-align:right}.strip svg{width:100%;height:18px}.strip div{display:flex;justify-content:space-between}
+.strip div:last-child{justify-content:flex-start;align-items:flex-end;gap:.4em}
+.strip i{width:22px;print-color-adjust:exact}.strip i:not(:first-child){margin-left:1em}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
 .note{background:var(--note);padding:.4em .8em;margin:.4em 0}.soft{color:var(--soft)}.good{color:var(--good)}.bad{color:var(--bad)}
 .verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;

@@ -7,14 +7,13 @@ import cv2
 import numpy as np
 
 from ..body.limb_words import FEW_FRAMES, limb_words
-from ..body.motion import BRIDGED, GUESSED, PARTIAL, SUSPECT, BodyFit
+from ..body.motion import BRIDGED, GUESSED, SEEN, SUSPECT, BodyFit
 from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
 from . import pictures
 
 PREDICTED = {
-    PARTIAL: "a limb rests on prediction",
     BRIDGED: "the whole pose is predicted",
     SUSPECT: "residuals are large or observations few",
 }
@@ -35,16 +34,20 @@ def verdict(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> s
     motion = body.motion
     sigma, own = (1e3 * np.median(s, axis=0) for s in (motion.joint_sigma_m, motion.joint_frame_sigma_m))
     worst, frames = int(sigma.argmax()), len(motion.frames)
+    limbs = limb_words(motion.joint_names, motion.known)
     predicted = {words: motion.status.count(status) for status, words in PREDICTED.items() if status in motion.status}
+    if unseen := sum(any(word != SEEN for word in row) for row in zip(*limbs.values())):
+        predicted["a limb is inferred or guessed"] = unseen
     less = "; ".join(f"in {n if n < frames else 'all'} of them {words}" for words, n in predicted.items())
     text = (
         f"The body was fitted in {frames} frames{f'; {less}' if less else ''}. "
         f"Reported sigma of its joints: {np.median(sigma):.1f} mm (median; {np.median(own):.1f} mm without what is common to all frames), "
         f"largest at {motion.joint_names[worst]} with {sigma[worst]:.0f} mm."
     )
-    guessed = [limb for limb, row in limb_words(motion.joint_names, motion.known).items() if row.count(GUESSED) > FEW_FRAMES]
+    guessed = {limb: row.count(GUESSED) for limb, row in limbs.items() if row.count(GUESSED) > FEW_FRAMES}
     if guessed:
-        text = f"{text} The {' and the '.join(guessed)} {'are' if len(guessed) > 1 else 'is'} guessed in some frames."
+        named = " and the ".join(f"{limb} in {count}" for limb, count in guessed.items())
+        text = f"{text} The {named} frames {'are' if len(guessed) > 1 else 'is'} guessed."
     contradicted = len({frame for frames in body.contradicted.values() for frame in frames})
     if contradicted:
         return f"{text} The images contradict it in {contradicted} frames: do not use these before you have looked at them."
@@ -76,8 +79,8 @@ def bone_sigma_mm(body: BodyFit, index: int) -> np.ndarray:
 
 
 def window_px(camera: Camera, joints_m: np.ndarray) -> float:
-    """Side [px] of a square about the joints (J, 3) in one view."""
-    return MARGIN * float(np.nanmax(np.ptp(camera.project(joints_m), axis=0), initial=1.0))
+    """Side [px] of a square about the joints (J, 3) in one view, no larger than the image."""
+    return min(MARGIN * float(np.nanmax(np.ptp(camera.project(joints_m), axis=0), initial=1.0)), *camera.size_px)
 
 
 def body_by_sigma(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarray, centre_px: np.ndarray, side_px: float) -> np.ndarray:

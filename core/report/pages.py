@@ -131,7 +131,7 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
     settings = SkinSettings(**record["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
-    chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
+    chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
 
     def add(name: str, caption: str, picture: np.ndarray) -> None:
@@ -160,6 +160,13 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
                 agreement = _agreement_caption(silhouettes, name, frame)
                 add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{agreement}", picture)
     return found
+
+
+def _first_middle_last(report: Report) -> list[int]:
+    """Indices of three frames; the middle one is near the middle, and one of those whose silhouettes were compared."""
+    count, frames = len(report.clouds), report.footage.frames
+    compared = {frames.index(fit.frame) for fit in report.silhouettes.fits if fit.frame in frames} or {count // 2}
+    return sorted({0, min(sorted(compared), key=lambda i: abs(i - count // 2)), count - 1})
 
 
 def _layers(report: Report, skin_at: Callable[[np.ndarray], Skin] | None) -> dict[str, tuple[str, np.ndarray]]:
@@ -197,9 +204,8 @@ def _strip(report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor
         monitor.step("report", 1, 2)
         centre, grey = camera.project(body.motion.joints_m[i]), footage.read(frames[i])[k]
         middle = 0.5 * (np.nanmin(centre, axis=0) + np.nanmax(centre, axis=0))
-        picture = body_by_sigma(
-            grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, window_px(camera, body.motion.joints_m[i])
-        )
+        skin, side = skin_at(body.motion.values[i]), window_px(camera, body.motion.joints_m[i])
+        picture = body_by_sigma(grey, camera, skin, bone_sigma_mm(body, i), middle, side)
         why = f": {report.doubtful[frames[i]]}" if frames[i] in report.doubtful else ""
         found.append((f"Frame {frames[i]}{why}", pictures.jpeg(picture)))
     return found
@@ -249,7 +255,7 @@ def _limbs(body: BodyFit | None) -> str:
         return ""
     frames, words = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
     lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
-    return f'<h2>Limbs</h2><div class="wide">{limb_strip(frames, words)}</div><p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
+    return f'<h2>Limbs</h2>{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
 
 
 def _limb_graphs(report: Report) -> dict[str, list[str]]:

@@ -21,6 +21,7 @@ BONE_COLOUR, JOINT_COLOUR = (60, 60, 230), (40, 220, 255)
 BODY_OUTLINE, PERSON_OUTLINE = (60, 220, 60), (40, 40, 240)
 OPACITY = 0.55
 PANEL_PX = 480
+LIGHT = np.array([-0.45, -0.55, -0.70])  # towards the light of a cloud from the front: upper left
 TAIL_FRAMES = 10
 
 
@@ -82,17 +83,17 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     radius = max(1, round(0.9 * spacing_px * float(centre[2]) / camera.focal_px * scale))
     front = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     side = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-    pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius) for R in (front, side)]
+    lit = ((front, LIGHT), (side, LIGHT * (-1, 1, 1)))  # from the side of the cameras, to which the normals point
+    pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius, light) for R, light in lit]
     for picture, names in zip(pair, (("x", "y"), ("z", "y"))):
         add_scale(picture, scale)
         add_axes(picture, names, left=names[0] == "z")
     return np.hstack(pair)
 
 
-def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int) -> np.ndarray:
-    """Points as discs, far ones first, lit from the upper left."""
+def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int, light: np.ndarray) -> np.ndarray:
+    """Points as discs, far ones first, lit along a unit vector (3,)."""
     picture = np.full((PANEL_PX, PANEL_PX, 3), 28, np.uint8)
-    light = np.array([-0.45, -0.55, -0.70])
     grey = 60 + 195 * np.clip(n @ light, 0, 1)
     for i in np.argsort(-p[:, 2]):
         at = (round(PANEL_PX / 2 + p[i, 0] * scale), round(PANEL_PX / 2 + p[i, 1] * scale))

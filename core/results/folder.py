@@ -21,7 +21,7 @@ from .run_json import FORMAT, VERSION
 RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
     "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4",
-    "body.blend",
+    "scene.mp4", "body.blend",
 )  # fmt: skip
 
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
@@ -166,18 +166,18 @@ class Results:
 
 
 class FitCheckpoints:
-    """The checkpoints of a running fit: cache/fit."""
+    """The checkpoints of a running fit: cache/fit, or another folder for a second fit of the same run."""
 
-    def __init__(self, results: Results, key: str) -> None:
-        self._results, self._key = results, key
+    def __init__(self, results: Results, key: str, folder: str = "fit") -> None:
+        self._results, self._key, self._folder = results, key, folder
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """The checkpoint of an interrupted fit of the same input, if there is one."""
-        return self._results.load_checkpoint("fit", name, self._key)
+        return self._results.load_checkpoint(self._folder, name, self._key)
 
     def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a checkpoint, in place of an earlier one of this name."""
-        self._results.save_checkpoint("fit", name, self._key, arrays)
+        self._results.save_checkpoint(self._folder, name, self._key, arrays)
 
 
 def _written(folder: Path) -> list[Path]:

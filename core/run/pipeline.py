@@ -29,7 +29,7 @@ from ..fitting.inputs.no_surface import background_regions, can_fit_without_surf
 from ..fitting.inputs.start_joints import NeedsClick
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
-from ..fitting.stages.sequence import fit_sequence
+from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -261,7 +261,8 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
     given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
     given = with_start(given, fitting, monitor)
-    body, tracked_again = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"])), dict[str, Any]()
+    body, start = fit_and_start(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
+    tracked_again = dict[str, Any]()
     loop = loop_of(fitting, body.shape.skeleton) if run.measured else OFF
     if run.measured and (fitting.track_again or loop != OFF):
         tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage))
@@ -269,10 +270,10 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
         clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
         contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
         given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
-        body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, f"{run.keys['fit']} again"))
+        body = fit_from(given, start, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"], "fit_again"))
     run.body = body
     _write_body(run, body, monitor)
-    run.results.remove("cache/fit")
+    run.results.remove("cache/fit", "cache/fit_again")
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again

@@ -1,8 +1,9 @@
 """Presets: sets of settings by name. The settings of take.toml and of the command win over those of the preset.
 
 "published" is the method of D'Apuzzo, Plänkers, Fua, Gruen & Thalmann 1999 (A) and D'Apuzzo & Plänkers 2000 (B), as far as they describe
-it. What they leave open stays as by default: how the person is separated from the background, limits and weak priors of the joints, and
-that motion is smooth over time.
+it. What they leave open stays as by default: how the person is separated from the background; that points whose rays miss each other, or
+with fewer than three neighbours, are no measured points; the values of all thresholds; robust weights in the fit; limits and weak priors
+of the joints; that motion is smooth over time.
 """
 
 from collections.abc import Mapping
@@ -55,6 +56,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "use_trajectories": False,
             "closed_loop": "off",
             "use_background": False,
+            "search_limbs": False,
             "complete_surface": False,
             "place_joints": "off",
         },

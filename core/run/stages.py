@@ -82,7 +82,7 @@ STAGE_INPUTS: dict[str, StageInput] = {
     "fit": StageInput(
         settings=("fitting", "skin"),
         take=_fit_input,
-        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4", "body.blend"),
+        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4", "scene.mp4", "body.blend"),
     ),
 }
 # Groups in no stage's key: a preset enters by its settings, the outlines of `tricap contour` by their content, chosen points do not.

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.__main__ import main
 from tricap.core.body.fields import potential_named
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
@@ -22,7 +23,7 @@ from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
 from tricap.core.body.skin.texture import TEXTURE
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
-from tricap.core.foundation.progress import Monitor
+from tricap.core.foundation.progress import Cancelled, Monitor
 
 from .conftest import FRAMES, SmallRun
 from .test_scene_body import animated, curves, world_vertices
@@ -348,25 +349,29 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
-def test_a_turntable_is_not_written_to_the_end_of_a_link(empty: ModuleType, tmp_path: Path) -> None:
-    from tricap.addon.scene import preview
+def test_a_movie_is_not_written_to_the_end_of_a_link(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.scene import movies
 
     (tmp_path / "letter.txt").write_text("mine")
     (tmp_path / ".t.part.mp4").symlink_to(tmp_path / "letter.txt")
-    preview._write_movie(tmp_path / "t.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    movies._write_movie(tmp_path / "t.mp4", [picture] * 2, 2, 25.0)
     assert (tmp_path / "letter.txt").read_text() == "mine" and (tmp_path / "t.mp4").stat().st_size > 100
+    with pytest.raises(InputError, match="could not be written whole"):
+        movies._write_movie(tmp_path / "lost.mp4", [picture] * 2, 3, 25.0)  # as on a full disk
+    assert not (tmp_path / "lost.mp4").exists() and not list(tmp_path.glob(".lost*"))
 
 
 @pytest.mark.slow
 def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
-    from tricap.addon.scene import build, contents, preview
+    from tricap.addon.scene import build, contents, movies, preview
     from tricap.core.foundation.progress import Monitor
 
     results = contents.read_contents(small_run.out, Monitor())
     build.write_scene(results)
     before = empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras)
     preview.preview(results, tmp_path / "p.png")
-    preview.turntable(tmp_path / "t.mp4")
+    movies.turntable(tmp_path / "t.mp4")
     assert before == (empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras))
     picture = cv2.imread(str(tmp_path / "p.png"))
     alone, over = np.split(picture.astype(float), 2, axis=1)
@@ -374,3 +379,26 @@ def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path:
     assert 0.01 < covered.mean() < 0.6 and over[~covered].std() > 1
     movie = cv2.VideoCapture(str(tmp_path / "t.mp4"))
     assert int(movie.get(cv2.CAP_PROP_FRAME_COUNT)) == 48
+
+
+@pytest.mark.slow
+def test_a_film_of_the_scene_shows_every_frame_from_another_side(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    """Without --blend only the movie is written; the camera circles, and leaves no trace in the scene; a stopped film is no film."""
+    from tricap.addon.scene import build, movies
+
+    assert main(["scene", str(small_run.out), "--film", str(tmp_path / "f.mp4"), "--turn", "180", "--quiet"]) == 0
+    movie, scene = cv2.VideoCapture(str(tmp_path / "f.mp4")), empty.context.scene
+    pictures = [movie.read()[1].astype(float) for _ in range(scene.frame_start, scene.frame_end + 1)]
+    assert not movie.read()[0] and len(pictures) == int(movie.get(cv2.CAP_PROP_FRAME_COUNT)) > 1
+    assert movie.get(cv2.CAP_PROP_FPS) == pytest.approx(scene.render.fps / scene.render.fps_base)
+    bright = [picture.max(axis=2) > 120 for picture in pictures]  # the body; the floor is darker
+    assert all(0.005 < b.mean() < 0.5 and not (b[0].any() or b[:, 0].any() or b[:, -1].any()) for b in bright)
+    assert np.abs(pictures[0] - pictures[-1]).max(axis=2)[bright[0] | bright[-1]].mean() > 20
+    assert [path.name for path in tmp_path.glob("*.*4")] == ["f.mp4"]
+    build.build_scene(small_run.out)
+    before, monitor = (scene.camera, scene.frame_current, scene.render.resolution_x, len(empty.data.cameras)), Monitor()
+    monitor.cancel()
+    with pytest.raises(Cancelled):
+        movies.film(tmp_path / "g.mp4", monitor, start_deg=0.0, turn_deg=0.0, elevation_deg=0.0)
+    assert before == (scene.camera, scene.frame_current, scene.render.resolution_x, len(empty.data.cameras))
+    assert [path.name for path in tmp_path.glob("*.*4")] == ["f.mp4"]

@@ -106,7 +106,7 @@ def fit_pose_and_shape(
 
 def _better_around(fit: FitContext, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> tuple[Solution, float]:
     """The solution and its score, where its residuals are too large a better one from the clicked pose or from others around it."""
-    if _plausible(best):
+    if _plausible(best) or not fit.settings.search_limbs:
         return best, best_score
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     for i, start in enumerate(_around(fit, clicked.motion[0])):

@@ -31,13 +31,12 @@ from ..observations import Observation, PosePrior
 from ..settings import FitSettings
 from ..solve.problem import Estimate, Problem
 from ..solve.solver import solve
-from ..solve.time_priors import typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
 from .contradicted import contradicted_joints
 from .inverse_kinematics import dof_priors, pose_as_clicked
 from .long_sequence import FrameResults, Recording, frame_results
-from .sequence import PATCH, SLIGHT_SIGMAS, frame_statuses, largest_accelerations, least_accelerations, posterior, standing, whole_sequence
-from .set_up import clicks_by_frame, context_of
+from .sequence import PATCH, SLIGHT_SIGMAS, frame_statuses, posterior, standing, whole_sequence
+from .set_up import acceleration_sigmas, clicks_by_frame, context_of
 from .sigma_parts import CLOTH_M, known
 
 REACH_S = 0.4  # from a click to the last frame that it may change
@@ -130,7 +129,7 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         frames=given.frames,
         points=[thinned(cloud, settings.voxel_m) for cloud in given.clouds],
         time_s=given.time_s,
-        sigma=typical_acceleration(earlier.values, observed, earlier.time_s, largest_accelerations(fit), least_accelerations(fit)),
+        sigma=acceleration_sigmas(fit, earlier.values, observed, earlier.time_s),
         tracks=MaterialTracks(given.trajectories, given.frames, model.surface, settings) if tracked and given.trajectories else None,
         lengths=(body.vector()[body.layout.group("lengths")], np.full(len(earlier.shape.lengths_m), np.inf)),
         feet=standing(fit, before, body.vector(), given.time_s),

@@ -38,7 +38,8 @@ def lost_limbs(fit: FitContext, counts: np.ndarray) -> list[Limb]:
 def reacquired_poses(
     fit: FitContext, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
 ) -> list[np.ndarray]:
-    """Poses (D,) of frame index `t` in which limbs explain what no other part does; none where there is too little.
+    """Poses (D,) of frame index `t` in which limbs explain what no other part does; none where there is too little, or without
+    `search_limbs`.
 
     At most one for each limb; each includes those before it. First the limbs without points; then, from the hands and feet inwards, those
     with points, perhaps another limb's, that leave more of what is seen nearby unexplained.
@@ -46,6 +47,8 @@ def reacquired_poses(
     Raises:
         Cancelled: the user asked to stop.
     """
+    if not fit.settings.search_limbs:
+        return []
     monitor, state = monitor or Monitor(), fit.parameters.state(motion, vector)
     evidence = fit.seen(t, points)
     _, owners = segment(points, state, fit.model.surface, fit.settings.gate_m)

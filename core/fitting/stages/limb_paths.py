@@ -57,7 +57,7 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     """
     given = replace(given, fit=replace(given.fit, silhouettes=given.fit.silhouettes.anew()))  # a resumed fit has others
     motion, fit = motion.copy(), given.fit
-    if not fit.background.known:
+    if not fit.background.known or not fit.settings.search_limbs:
         return motion
     begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
     runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]

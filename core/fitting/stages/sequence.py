@@ -19,7 +19,7 @@ joints. The prior that bones are as long as other people's counts for all frames
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -40,7 +40,7 @@ from ..settings import FitSettings
 from ..smooth_radii import smooth_radii
 from ..solve.problem import Estimate, Problem, Scales, linearise, variance_factors
 from ..solve.solver import Solution, solve
-from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
+from ..solve.time_priors import Acceleration, Coupling, MarginalPrior, marginal_prior
 from ..start.taken_back import taken_back
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import ALTERNATION_STEPS, clicked_lengths, fit_click_frame
@@ -66,7 +66,7 @@ from .long_sequence import (
     sample,
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
-from .set_up import fit_context, with_start
+from .set_up import acceleration_sigmas, fit_context, with_start
 from .sigma_parts import known, sigma_parts
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
@@ -75,10 +75,18 @@ ADJUST = "adjust the sequence"  # stages of the progress report
 SIGMAS = "sigmas of the fit"
 ERROR_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that have the simplified body's surface
-LEAST_ANGULAR = 0.3  # of the largest sigmas of angular accelerations: 1,800°/s², as elbows and knees have
 SLIGHT_SIGMAS = 0.05  # rms over the parameters: steps that gain less do not bring joints nearer to the truth, but to the model's errors
 PATCH = 5 / 6  # of `model_patch_m`: against accelerations points weigh more than against the prediction of one frame
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SequenceStart:
+    """Where the adjustment over T frames starts: the tracked poses, and the body of the click frame."""
+
+    motion: np.ndarray  # (T, D)
+    observed: np.ndarray  # (T, D) where observations constrain it
+    first: Solution  # of the click frame
 
 
 def fit_sequence(
@@ -93,35 +101,69 @@ def fit_sequence(
             without more clicks, the motion contradicts that start, or the limb has no points where the fit begins.
         Cancelled: the user asked to stop.
     """
-    settings, monitor = settings or FitSettings(), monitor or Monitor()
+    return fit_and_start(given, settings or FitSettings(), monitor or Monitor(), checkpoints)[0]
+
+
+def fit_and_start(
+    given: FitInput, settings: FitSettings, monitor: Monitor, checkpoints: Checkpoints | None = None
+) -> tuple[BodyFit, SequenceStart]:
+    """`fit_sequence`, and where a further adjustment of the same frames starts (`fit_from`)."""
     given = with_start(given, settings, monitor)
-    fit = replace(fit_context(given, settings), monitor=monitor)
-    points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
-    if len(points) <= AT_ONCE:
-        points = _read(points, monitor)
+    fit, points = _prepared(given, settings, monitor)
     first = fit_click_frame(fit, points[fit.click], monitor)
-    tracks = None
-    if given.trajectories is not None and settings.use_trajectories:
-        tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
-    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=tracks)
+    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=_material_tracks(given, fit))
     motion, observed = track_poses(tracking, monitor, checkpoints)
     motion = follow_limbs(tracking, motion, monitor)
     if given.start is not None and (contradicted := taken_back(fit, given.start, points, motion, first.vector, monitor)):
         raise NeedsClick(contradicted)
-    settings = replace(settings, model_patch_m=PATCH * settings.model_patch_m)
+    start = SequenceStart(motion=motion, observed=observed, first=first)
+    return _adjusted_body(given, tracking, start, monitor, checkpoints), start
+
+
+def fit_from(
+    given: FitInput, start: SequenceStart, settings: FitSettings, monitor: Monitor, checkpoints: Checkpoints | None = None
+) -> BodyFit:
+    """Shape and motion of the same frames from other trajectories, points or outlines, without tracking the poses again.
+
+    It starts from the tracked poses, and not from the first adjustment: that one ended where further steps follow the model's errors.
+    """
+    fit, points = _prepared(given, settings, monitor)
+    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=start.first, tracks=_material_tracks(given, fit))
+    return _adjusted_body(given, tracking, start, monitor, checkpoints)
+
+
+def _prepared(given: FitInput, settings: FitSettings, monitor: Monitor) -> tuple[FitContext, Sequence[CloudPoints]]:
+    """The context, and the thinned points of all frames."""
+    fit = replace(fit_context(given, settings), monitor=monitor)
+    points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
+    return fit, _read(points, monitor) if len(points) <= AT_ONCE else points
+
+
+def _material_tracks(given: FitInput, fit: FitContext) -> MaterialTracks | None:
+    if given.trajectories is None or not fit.settings.use_trajectories:
+        return None
+    return MaterialTracks(given.trajectories, given.frames, fit.model.surface, fit.settings)
+
+
+def _adjusted_body(
+    given: FitInput, tracking: PoseTracking, start: SequenceStart, monitor: Monitor, checkpoints: Checkpoints | None
+) -> BodyFit:
+    """Step 4 and those after it."""
+    fit, points, first, motion = tracking.fit, tracking.points, tracking.first, start.motion
+    settings = replace(fit.settings, model_patch_m=PATCH * fit.settings.model_patch_m)
     fit = replace(fit, silhouettes=fit.silhouettes.drawn_only(), settings=settings)
     whole = Recording(
         fit=fit,
         frames=given.frames,
         points=points,
         time_s=given.time_s,
-        sigma=typical_acceleration(motion, observed, given.time_s, largest_accelerations(fit), least_accelerations(fit)),
-        tracks=tracks,
+        sigma=acceleration_sigmas(fit, motion, start.observed, given.time_s),
+        tracks=tracking.tracks,
         lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
         feet=standing(fit, motion, first.vector, given.time_s),
     )
-    start = Estimate(motion=motion, vector=first.vector)
-    return _at_once(whole, start, monitor) if len(points) <= AT_ONCE else _in_stretches(whole, start, monitor, checkpoints)
+    begin = Estimate(motion=motion, vector=first.vector)
+    return _at_once(whole, begin, monitor) if len(points) <= AT_ONCE else _in_stretches(whole, begin, monitor, checkpoints)
 
 
 def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
@@ -275,21 +317,6 @@ def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
     """The same context for the complete model of a simplified body (S,)."""
     shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
-
-
-def largest_accelerations(fit: FitContext) -> np.ndarray:
-    """The largest sigma (D,) of accelerations."""
-    s, skeleton = fit.settings, fit.model.skeleton
-    sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
-    sigma[skeleton.layout.group("base")] = s.acceleration_m_s2
-    return sigma
-
-
-def least_accelerations(fit: FitContext) -> np.ndarray:
-    """The least sigma (D,) of accelerations over the largest, however steady the observed motion."""
-    share = np.full(len(fit.model.skeleton.dofs), LEAST_ANGULAR)
-    share[fit.model.skeleton.layout.group("base")] = LEAST
-    return share
 
 
 def whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:

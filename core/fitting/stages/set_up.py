@@ -21,6 +21,7 @@ from ..inputs.start_joints import NeedsClick, StartJoints
 from ..observations import ClickedJoints, Keypoints, Observation
 from ..observations.self_collision import CollisionPairs
 from ..settings import FitSettings
+from ..solve.time_priors import LEAST, typical_acceleration
 from ..start.find import find_start
 from ..state import ShapeParameters
 from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors, trunk_joints
@@ -28,6 +29,7 @@ from .long_sequence import AT_ONCE
 
 FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
 FOUND = tuple(f"{joint}{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in (".L", ".R"))
+LEAST_ANGULAR = 0.3  # of the largest sigmas of angular accelerations: 1,800°/s², as elbows and knees have
 WHOLE = "full"  # the model that is looked for, whatever part of it is fitted
 
 
@@ -198,3 +200,12 @@ def _found_clicks(clicks: Clicks, start: StartJoints, names: tuple[str, ...]) ->
 def _best_located(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
     """The frame index with most clicked joints; without clicks, the one with most keypoints."""
     return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()
+
+
+def acceleration_sigmas(fit: FitContext, motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """The sigmas (D,) of accelerations, by a motion (T, D) where it is observed, and not less than the least, however steady it is."""
+    s, skeleton = fit.settings, fit.model.skeleton
+    largest, share = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2)), np.full(len(skeleton.dofs), LEAST_ANGULAR)
+    base = skeleton.layout.group("base")
+    largest[base], share[base] = s.acceleration_m_s2, LEAST
+    return typical_acceleration(motion, observed, time_s, largest, share)

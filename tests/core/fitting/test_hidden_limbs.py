@@ -60,6 +60,9 @@ def test_a_raised_arm_is_found(standing) -> None:
     moved = np.flatnonzero(np.abs(found - before) > 1e-9)
     assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in moved} <= {"shoulder.R", "elbow.R"}
     assert not reacquired_poses(fit, 0, points_of(shape, raised, others), before, vector)  # hidden: nothing is invented
+    unsought = replace(fit, settings=replace(fit.settings, search_limbs=False))
+    seen = points_of(shape, raised, others | {"upper_arm.R": 80, "forearm.R": 80})
+    assert not reacquired_poses(unsought, 0, seen, before, vector)  # as published
 
 
 def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from tricap.core.fitting.solve.time_priors import MarginalPrior
 from tricap.core.fitting.stages import long_sequence, pose_tracking, sequence
+from tricap.core.fitting.stages.pose_tracking import CHECKPOINT
 from tricap.core.fitting.stages.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.results.folder import FitCheckpoints, Results
@@ -75,6 +76,10 @@ def test_checkpoints_of_another_take_are_not_used(given: FitInput, tmp_path: Pat
     with pytest.raises(Cancelled):
         fit_sequence(given, SETTINGS, monitor, FitCheckpoints(Results(tmp_path / "out"), "another"))
     assert monitor.frames == 0
+    with pytest.raises(Cancelled):  # a second fit of the same run has checkpoints of its own, beside those of the first
+        fit_sequence(given, SETTINGS, Stopper(6), FitCheckpoints(Results(tmp_path / "out"), "again", "fit_again"))
+    first, second = (FitCheckpoints(Results(tmp_path / "out"), *which) for which in (("key",), ("again", "fit_again")))
+    assert first.load(CHECKPOINT) is not None and second.load(CHECKPOINT) is not None
 
 
 class StoppedStretches(Monitor):

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 from base64 import b64encode
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from tricap.core.body.motion import BodyFit, BodyMotion
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.foundation import store
+from tricap.core.report import overview
 from tricap.core.report.document import STYLE, document, figure, notes, table
 from tricap.core.report.figures import figures_csv
 from tricap.core.report.graphs import SCRIPT, curve_graph
@@ -66,16 +68,21 @@ def fitted(**changes: Any) -> BodyFit:
     return BodyFit(**{**given, **changes})  # type: ignore[arg-type]
 
 
-def test_the_verdict_reports_doubt_before_anything_sounds_certain() -> None:
+def test_the_verdict_reports_doubt_before_anything_sounds_certain(monkeypatch: pytest.MonkeyPatch) -> None:
     record = {"stages": {"measure": {"frames": 3, "points_per_frame": 1234.0, "sigma_mm": 0.4}, "fit": {"not_done": "no clicked joints"}}}
     assert "1,234 points a frame" in verdict(record, None, 0) and "No body was fitted: no clicked joints." in verdict(record, None, 0)
     assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None, 0)
     good = verdict(record, fitted(), 0)
     assert (
-        "fitted in 3 frames; in 1 of them a limb rests on prediction." in good
+        "fitted in 3 frames. Reported" in good
         and "largest at wrist.R with 60 mm" in good
         and good.endswith("No frame stands out as doubtful.")
     )
+    names = ARM.skeleton.joint_names
+    monkeypatch.setattr(overview, "FEW_FRAMES", 0)
+    rows = [tuple(word if name == "wrist.R" else "seen" for name in names) for word in ("seen", "inferred", "guessed")]
+    unseen = verdict(record, fitted(motion=replace(fitted().motion, known=tuple(rows))), 0)
+    assert "in 2 of them a limb is inferred or guessed" in unseen and "The right arm in 1 frames is guessed." in unseen
     assert verdict(record, fitted(), 2).endswith("2 frames are doubtful; the worst are shown here.")
     assert "has not converged" in verdict(record, fitted(converged=False), 0)
     assert "contradict it in 2 frames" in verdict(record, fitted(contradicted={"forearm.R": (0, 1)}, converged=False), 1)
@@ -197,7 +204,7 @@ def test_names_are_text(tmp_path: Path) -> None:
 
 
 @needs_browser
-@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark"), (794, 4, "paper")])
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 4, "light"), (500, 2, "dark"), (794, 3, "paper")])
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
