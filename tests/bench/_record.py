@@ -1,4 +1,4 @@
-"""Results of a benchmark in pieces: one line of JSON for each seed is appended to a file, and the next call does those that are not in it."""
+"""Results of a benchmark in pieces: a line of JSON for each seed is appended to a file, and the next call does those that are not in it."""
 
 import json
 import time
