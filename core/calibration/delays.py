@@ -30,7 +30,8 @@ WIDTH = 0.01  # of the image width: points further from their line count as that
 SEARCH_POSITIONS = 200
 ITERATIONS = 500
 JUMP = 8.0  # times the median: further from the path through its neighbours, a point is wrong
-JUMP_ROUNDS = 4
+JUMP_ROUNDS = 6
+FEWEST_AROUND, MOST_AROUND = 3, 4  # points from which one is predicted
 FEWEST_POINTS = 24  # of a pair of cameras
 LEAST_SHARE = 0.4  # of the positions that the pair shares at once: fewer fit by chance
 
@@ -127,21 +128,48 @@ def _still(frames: np.ndarray, xy_px: np.ndarray, expected_images: np.ndarray | 
 
 
 def without_jumps(frames: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
-    """The points (N, C, K, 2) without those that jump out of their path through the images before and after."""
+    """The points (N, C, K, 2) without those that jump out of their path through the images before and after.
+
+    Each point is predicted from the two nearest ones before it and after it, or from three. The distance is compared with its median in
+    the camera, for four and for three points apart, and with that of the neighbours, which a wrong point spoils.
+    """
     xy = xy_px.copy()
+    weights, noise, count = _predictions()
     for _ in range(JUMP_ROUNDS):
         held = _still(frames, xy)
-        near = {s: held.shifted(s) for s in (-2, -1, 1, 2)}
-        off = np.linalg.norm(xy - (4 * (near[-1] + near[1]) - near[-2] - near[2]) / 6, axis=-1)
-        off = np.nan_to_num(off)
-        limit = JUMP * np.array([np.median(o[o > 0]) if (o > 0).any() else np.inf for o in np.moveaxis(off, 1, 0)])
-        rows = {s: held.rows(s) for s in near}
-        around = np.max([np.where(known[:, None, None], off[at], 0.0) for at, known in rows.values()], axis=0)
-        wrong = (off > limit[:, None]) & (off >= around)
+        near = np.stack([held.shifted(int(s)) for s in STEPS], axis=-2)  # (N, C, K, 7, 2)
+        subset = np.isfinite(near[..., 0]) @ (1 << np.arange(len(STEPS)))
+        predicted = np.einsum("ncks,ncksx->nckx", weights[subset], np.nan_to_num(near))
+        off = np.nan_to_num(np.linalg.norm(xy - predicted, axis=-1) / noise[subset])
+        limit = np.full(off.shape, np.inf)
+        for c in range(off.shape[1]):
+            for number in FEWEST_AROUND, MOST_AROUND:
+                of_kind = (count[subset[:, c]] == number) & (off[:, c] > 0)
+                if of_kind.any():
+                    limit[:, c][of_kind] = JUMP * np.median(off[:, c][of_kind])
+        around = np.max([np.where(known[:, None, None], off[at], 0.0) for at, known in map(held.rows, (-2, -1, 1, 2))], axis=0)
+        wrong = (off > limit) & (off >= around)
         if not wrong.any():
             break
         xy[wrong] = np.nan
     return xy
+
+
+@lru_cache(maxsize=1)
+def _predictions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each of the 128 subsets of STEPS that may be known: the weights (128, 7) that predict the point at 0 from the others, the sigma
+    (128,) of the difference for points of sigma 1, and how many points predict it; NaN and 0 where there are too few."""
+    subsets = 1 << len(STEPS)
+    weights, noise, count = np.full((subsets, len(STEPS)), np.nan), np.full(subsets, np.nan), np.zeros(subsets, dtype=int)
+    for subset in range(subsets):
+        known = np.flatnonzero(subset >> np.arange(len(STEPS)) & 1)
+        before, after = known[STEPS[known] < 0][-NEAR:], known[STEPS[known] > 0][:NEAR]
+        some = np.concatenate([before, after])
+        if len(before) and len(after) and len(some) >= FEWEST_AROUND:
+            weights[subset], count[subset] = 0.0, len(some)
+            weights[subset, some] = np.linalg.inv(np.vander(STEPS[some], increasing=True))[0]
+            noise[subset] = np.sqrt(1 + np.sum(weights[subset] ** 2))
+    return weights, noise, count
 
 
 def first_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> np.ndarray:

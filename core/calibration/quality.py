@@ -161,28 +161,25 @@ def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
 
 def _lengths(observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
     """Lengths of the positions `which` (N,) from the image points `used` (N, C, K), each point intersected independently.  (1)"""
-    parts = [_lengths_between(observations, used, cameras, which, pair) for pair in observations.tested_pairs]
-    return _together(parts)
-
-
-def _lengths_between(
-    observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray, pair: tuple[int, int, float]
-) -> Lengths:
-    of_pair = list(pair[:2])
-    rows = np.flatnonzero(which & (used[:, :, of_pair].sum(axis=1) >= 2).all(axis=1))
-    xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)[:, :, of_pair]
-    xy = np.moveaxis(xy, 2, 1).reshape(2 * len(rows), len(cameras), 2)
-    found = forward_intersection(cameras, xy, np.broadcast_to(np.eye(2), (*xy.shape, 2)))
-    ends = found.xyz_m.reshape(-1, 2, 3)
-    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    along = (ends[:, 0] - ends[:, 1]) / length[:, None]
-    variance = np.einsum("ni,nkij,nj->n", along, found.covariance_m2.reshape(-1, 2, 3, 3), along)
-    finite = np.isfinite(length)
+    pairs = observations.tested_pairs
+    points = sorted({k for pair in pairs for k in pair[:2]})
+    rows = np.flatnonzero(which)
+    keep = used[rows][:, :, points]
+    xy = np.where(keep[..., None], observations.xy_px[rows][:, :, points], np.nan)
+    flat = np.moveaxis(xy, 2, 1).reshape(-1, len(cameras), 2)
+    found = forward_intersection(cameras, flat, np.broadcast_to(np.eye(2), (*flat.shape, 2)))
+    xyz, Q = found.xyz_m.reshape(len(rows), -1, 3), found.covariance_m2.reshape(len(rows), -1, 3, 3)
+    a, b = (np.searchsorted(points, [pair[end] for pair in pairs]) for end in (0, 1))
+    difference = xyz[:, a] - xyz[:, b]  # (n, pairs, 3)
+    length = np.linalg.norm(difference, axis=-1)
+    along = difference / np.maximum(length, 1e-12)[..., None]
+    variance = np.einsum("npi,npij,npj->np", along, Q[:, a] + Q[:, b], along)
+    there = np.isfinite(length).T  # pair by pair
     return Lengths(
-        residual_m=(length - pair[2])[finite],
-        sigma_per_px_m=np.sqrt(variance[finite]),
-        middle_m=ends.mean(axis=1)[finite],
-        frames=observations.frames[rows][finite],
+        residual_m=(length - [pair[2] for pair in pairs]).T[there],
+        sigma_per_px_m=np.sqrt(variance.T[there]),
+        middle_m=((xyz[:, a] + xyz[:, b]) / 2).swapaxes(0, 1)[there],
+        frames=np.broadcast_to(observations.frames[rows], there.shape)[there],
     )
 
 

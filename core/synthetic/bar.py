@@ -154,9 +154,8 @@ def bar_ends(positions: int, rng: np.random.Generator, length_m: float, delay_im
     reach = (VOLUME_SIZE_M / 2) * 0.98 - length_m / 4
     centre = VOLUME_CENTRE_M + reach * np.sin(rates * time[:, None] + rng.uniform(0, 2 * np.pi, 3))
     azimuth = 0.231 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi)
-    height = np.sin(0.1673 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi))
-    across = np.sqrt(1 - height**2)
-    direction = np.stack([across * np.cos(azimuth), height, across * np.sin(azimuth)], axis=-1)
+    tilt = 0.1673 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi)  # through the upright and on, as smoothly as a hand turns
+    direction = np.stack([np.cos(tilt) * np.cos(azimuth), np.sin(tilt), np.cos(tilt) * np.sin(azimuth)], axis=-1)
     return np.stack([centre + direction * length_m / 2, centre - direction * length_m / 2], axis=1)
 
 

@@ -1,6 +1,6 @@
 """Boards held before random rigs: how many are calibrated from nothing, how near the bound, and how well they predict their error.
 
-    .venv/py3.13/bin/python tests/bench/board_rigs.py [--rigs 200] [--first SEED] [--seconds S]
+    .venv/py3.13/bin/python tests/bench/board_rigs.py [--rigs 200] [--first SEED] [--seconds S] [--record FILE]
 
 Every fifth rig has two cameras, every fifth fisheye lenses of 150°; the others are those of `RIG_KINDS`. One direction of error dominates,
 so single ratios scatter; their RMS is that of the object points in units of the bound.
@@ -8,12 +8,13 @@ so single ratios scatter; their RMS is that of the object points in units of the
 
 import argparse
 import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.bench._record import recorded
 from tests.core.calibration.test_boards import CHESSBOARD, SMALL, bound_m, observed
 from tests.core.calibration.truth import TEST_BARS, error_m, rigid
 from tricap.core.calibration.calibrate import calibrate_rig
@@ -28,8 +29,13 @@ SIGMA_PX = 0.1
 CONVERGED = 4.0  # times the bound
 
 
-def one(seed: int) -> tuple[str, float, float, str]:
+def one(seed: int) -> dict[str, Any]:
     """Kind of the rig, error and predicted error as multiples of the bound (NaN: refused), and the verdict's light."""
+    kind, error, predicted, light = _calibrated(seed)
+    return {"kind": kind, "error": error, "predicted": predicted, "light": light}
+
+
+def _calibrated(seed: int) -> tuple[str, float, float, str]:
     rng = np.random.default_rng(seed)
     kind = "fisheye" if seed % 5 == 4 else RIG_KINDS[seed // 5 % len(RIG_KINDS)]
     cameras = fisheye_cameras(rng) if kind == "fisheye" else random_cameras(rng, kind)
@@ -61,14 +67,13 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=np.inf, help="stop after so much time")
+    parser.add_argument("--record", type=Path, help="a file of results, continued by the next call")
     args = parser.parse_args()
-    began, rows = time.monotonic(), list[tuple[str, float, float, str]]()
-    for seed in range(args.first, args.first + args.rigs):
-        if time.monotonic() - began > args.seconds:
-            break
-        rows.append(one(seed))
-        if not rows[-1][1] < CONVERGED:
-            print(f"rig {seed}: {rows[-1]}", flush=True)
+    found = recorded(args.record, range(args.first, args.first + args.rigs), one, args.seconds)
+    rows = [tuple(row.values()) for row in found.values()]
+    for seed, row in found.items():
+        if not row["error"] < CONVERGED:
+            print(f"rig {seed}: {row}", flush=True)
     for kind in (*sorted({row[0] for row in rows}), "all"):
         some = [row for row in rows if kind in (row[0], "all")]
         ratio, predicted = np.array([row[1:3] for row in some if row[1] < CONVERGED]).reshape(-1, 2).T

@@ -1,6 +1,6 @@
 """Board calibrations from spoilt observations: how often a wrong rig is called good.
 
-    .venv/py3.13/bin/python tests/bench/spoilt_boards.py [--sets 1000] [--first SEED] [--seconds S]
+    .venv/py3.13/bin/python tests/bench/spoilt_boards.py [--sets 1000] [--first SEED] [--seconds S] [--record FILE]
 
 Every set is a random rig (in line, around, two cameras …) with a board held in front of it, spoilt in one of KINDS. A rig is wrong if
 points in space are more than WRONG times as far off as the Cramér–Rao bound of the set without the fault and without wrong corners. One
@@ -10,15 +10,15 @@ than given cannot be found from images of the board alone, and is none of the ki
 
 import argparse
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.bench._record import recorded
 from tests.core.calibration.test_boards import CHESSBOARD, bound_m, mirrored, observed
 from tests.core.calibration.truth import error_m
 from tricap.core.calibration.calibrate import calibrate_rig
@@ -146,12 +146,13 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=np.inf, help="stop after so much time")
+    parser.add_argument("--record", type=Path, help="a file of results, continued by the next call")
     args = parser.parse_args()
-    began, found = time.monotonic(), Counter[tuple[str, str]]()
-    for seed in range(args.first, args.first + args.sets):
-        if time.monotonic() - began > args.seconds:
-            break
-        set_ = outcome(seed)
+    seeds = range(args.first, args.first + args.sets)
+    rows = recorded(args.record, seeds, lambda seed: asdict(outcome(seed)), args.seconds)
+    sets = {seed: Outcome(**row) for seed, row in rows.items()}
+    found = Counter[tuple[str, str]]()
+    for seed, set_ in sets.items():
         found[set_.kind, f"{set_.light}, wrong" if set_.wrong else set_.light] += 1
         if set_.light == "green" and set_.wrong:
             said = f"{1e3 * set_.error_m:.2f} mm wrong where {1e3 * set_.predicted_m:.2f} are predicted"

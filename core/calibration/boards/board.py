@@ -5,6 +5,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -95,9 +96,7 @@ class Board:
     @property
     def corners_m(self) -> np.ndarray:
         """(K, 3) the inner corners in rows, in the board's frame: x along a row, y down, z = 0, the middle of the board is the origin."""
-        columns, rows = self.grid
-        x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
-        return np.stack([x.ravel(), y.ravel(), np.zeros(columns * rows)], axis=1) * self.square_m
+        return _corners(self.grid, self.square_m)
 
     @property
     def diagonals(self) -> tuple[tuple[int, int, float], ...]:
@@ -151,6 +150,15 @@ class Board:
         dark = np.indices((rows, columns)).sum(axis=0) % 2 == 0
         squares = np.where(dark, 0, 255).astype(np.uint8)
         return np.pad(squares.repeat(side, axis=0).repeat(side, axis=1), side, constant_values=255)
+
+
+@lru_cache(maxsize=16)
+def _corners(grid: tuple[int, int], square_m: float) -> np.ndarray:
+    columns, rows = grid
+    x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
+    corners = np.stack([x.ravel(), y.ravel(), np.zeros(columns * rows)], axis=1) * square_m
+    corners.setflags(write=False)
+    return corners
 
 
 def write_board(path: Path, board: Board) -> None:

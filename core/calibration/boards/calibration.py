@@ -18,6 +18,7 @@ import numpy as np
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...geometry.camera import INTERIOR, image_with_derivatives
+from ...geometry.robust import masked_median
 from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
 from ..delays import MovingPoints, PlacedPoints, first_delays, moving_points, placed_points
 from ..network import BoardNetwork
@@ -360,7 +361,7 @@ def view_residuals(network: BoardNetwork, observations: BoardObservations) -> np
     """Median distance [px] of the corners of each view (N, C) from those of the network; 0 where a camera does not show the board."""
     off = np.linalg.norm(residuals(network, observations.xy_px), axis=-1)
     shown = observations.views(observations.visible)
-    return np.where(shown, np.nanmedian(np.where(shown[..., None], off, 0.0), axis=-1), 0.0)
+    return np.where(shown, masked_median(off, np.isfinite(off)), 0.0)
 
 
 def split_apart(network: BoardNetwork, observations: BoardObservations, sigma_px: float) -> tuple[BoardNetwork, BoardObservations]:

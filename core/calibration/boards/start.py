@@ -16,6 +16,7 @@ import numpy as np
 
 from ...foundation.errors import InputError
 from ...geometry.camera import INTERIOR, Camera
+from ...geometry.robust import masked_median
 from ..bars import undistorted
 from ..bundle import LevenbergMarquardt, adjust
 from ..network import BoardNetwork
@@ -238,9 +239,8 @@ def _misses(
     image = _angles(image)
     with np.errstate(invalid="ignore"):
         every = np.stack([np.linalg.norm(x - image[..., order, :], axis=-1) for order in symmetries])
-    every = np.where(np.isfinite(every), every, np.nan)
-    few = np.isfinite(every).sum(axis=-1) < FEWEST_CORNERS
-    middle = np.where(few, np.inf, np.nanmedian(np.where(few[..., None], 0.0, every), axis=-1))
+    known = np.isfinite(every)
+    middle = np.where(known.sum(axis=-1) < FEWEST_CORNERS, np.inf, masked_median(every, known))
     return middle.min(axis=0), middle.argmin(axis=0)
 
 

@@ -21,7 +21,7 @@ from tricap.core.calibration.bundle import (
 from tricap.core.calibration.delays import moving_points, without_jumps
 from tricap.core.calibration.self_calibration import redundant_parts
 from tricap.core.geometry.camera import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
-from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
+from tricap.core.synthetic.bar import BarNoise, bar_ends, benchmark_cameras, random_cameras, waved_bar
 
 from .truth import true_network
 
@@ -157,3 +157,18 @@ def test_a_point_that_jumps_is_left_out_and_its_neighbours_are_kept() -> None:
     path[17, 1] += 6.0
     left = np.isfinite(without_jumps(at, path)[..., 0, 0])
     assert not left[17, 1] and left.sum() == 79
+
+
+def test_points_that_jump_are_found_beside_missing_ones() -> None:
+    """Measured over 24 recordings: 27 of 791 wrong points remain, all without neighbours on one side; it was 301 of them."""
+    waved = waved_bar(benchmark_cameras(), 300, np.random.default_rng(5), BarNoise(sigma_px=0.05), pace=0.5)
+    seen = np.isfinite(waved.xy_px[..., 0])
+    gone = seen & ~np.isfinite(without_jumps(np.arange(300), waved.xy_px)[..., 0])
+    wrong = waved.wrong & seen
+    assert wrong.sum() > 25 and (gone & wrong).sum() > 0.9 * wrong.sum() and (gone & ~wrong).sum() < 0.25 * wrong.sum()
+
+
+def test_the_synthetic_wave_has_no_jerks() -> None:
+    """Interpolation between images needs paths without jumps of their velocity."""
+    ends = bar_ends(4000, np.random.default_rng(3), 0.5, pace=0.05)
+    assert np.abs(np.diff(ends, n=2, axis=0)).max() < 2e-4  # m per image², of the smooth motion

@@ -8,7 +8,6 @@ import pytest
 from tricap.core.calibration import report
 from tricap.core.calibration.bundle import Unknowns
 from tricap.core.calibration.calibrate import calibrate_rig
-from tricap.core.calibration.delays import first_delays, moving_points, without_jumps
 from tricap.core.calibration.precision import predicted_error, with_left_out
 from tricap.core.calibration.quality import held_out_lengths
 from tricap.core.calibration.self_calibration import calibrate
@@ -226,11 +225,10 @@ def test_cameras_that_are_not_in_step_are_calibrated_as_well(delay_images: tuple
     assert "Camera R took its images" in page and "than camera L; the adjustment allows for it." in page
 
 
-def test_delays_that_turn_out_not_to_be_significant_leave_no_trace() -> None:
-    """Pairs of these synchronised cameras seem to be 0.1 images apart at first; points moved by that gave a rig that was wrong by 3 mm."""
+def test_delays_that_turn_out_not_to_be_significant_leave_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where pairs of synchronised cameras seem to be 0.1 images apart at first, points moved by that gave a rig that was wrong by 3 mm."""
     together = waved_out_of_step(12, (0.0, 0.0, 0.0))
-    moving = moving_points(np.arange(300), without_jumps(np.arange(300), together.xy_px))
-    assert first_delays(moving, observed(together).size_px, labelled=True).any()
+    monkeypatch.setattr("tricap.core.calibration.self_calibration.first_delays", lambda *_: np.array([0.0, 0.1, 0.0]))
     done = calibrate(observed(together), Monitor())
     assert not done.delays and done.sigma0_px == pytest.approx(0.05, rel=0.05)
     assert error_m(together.cameras, done.network.cameras(done.observations.names, done.observations.size_px)) < 3e-4
@@ -251,4 +249,5 @@ def test_delays_are_found_to_a_third_of_a_millisecond() -> None:
         together_m.append(ratio(together, 0.05) * bound(together, 0.05).rms_m)
     assert np.sqrt(np.mean(np.square(off))) < 0.3  # measured: 0.005
     rms = np.sqrt(np.mean(np.square(apart_m)) / np.mean(np.square(together_m)))
-    assert rms < 1.2, (apart_m, together_m)  # measured: 1.17 (median of the ratios 1.21), with 2 % of wrong points and 10 % missing
+    median = np.median(np.divide(apart_m, together_m))
+    assert max(rms, median) < 1.2, (apart_m, together_m)  # measured: 1.10 both, worst 1.25, with 2 % of wrong points and 10 % missing
