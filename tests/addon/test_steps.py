@@ -666,6 +666,8 @@ def test_the_panel_names_buttons_and_settings_instead_of_files_and_options(blend
         "Doubtful: View C is late. Use Correct true (step 4 Surface), which helps.",
     ]
     assert "offset_frames" in check.in_panel(checked, check.Mends())[0], "without a button the file is named"
+    remarked = findings.Checked(subject="kick", kind="take", findings=(), figures={}, notes=("Note: a frame is repeated.",))
+    assert check.in_panel(remarked, check.Mends()) == [check.GOOD, "Note: a frame is repeated."]
 
 
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])
