@@ -168,8 +168,8 @@ class ClickOperator:
         if not session.changed or not session.has_all_clips:
             return {"FINISHED" if session.changed else "CANCELLED"}
         done = len(session.names) - len(session.missing(skipped=True))
-        result = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two or more views."
-        self.report({"INFO"}, f"{result}{_what_is_missing(session)} Press Back to Steps, above the first view.")  # type: ignore[attr-defined]
+        result = f"Frame {session.frame}: {done} of {len(session.names)} clicked in two or more views."
+        self.report({"INFO"}, f"{result}{_what_is_missing(session)} Go on with the buttons above the first view.")  # type: ignore[attr-defined]
         return {"FINISHED"}
 
 

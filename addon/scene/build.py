@@ -24,11 +24,11 @@ from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
+from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .looking import look_at
-from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
+from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, POINTS_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
 from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser
 
@@ -85,7 +85,7 @@ def write_scene(
     counts: dict[str, int] = {}
     counts["cameras"] = _add_cameras(scene, _part(collection, "Cameras"), contents, opened, warnings)
     measured = _part(collection, "Measured")
-    measured.hide_render = True
+    measured.hide_render = measured[POINTS_KEY] = True
     counts["cloud points"] = _add_cloud(measured, contents, options, warnings)
     if contents.trajectories is not None:
         counts["trajectories"] = _add_trajectories(measured, contents, contents.trajectories, options, warnings)
@@ -93,6 +93,9 @@ def write_scene(
     counts |= _add_body(body, contents, warnings, options, blend)
     if surface is not None:
         skin.add_implicit(measured, *surface, potential_named(options.field))
+    wanted = options.arrows or options.implicit or contents.raw is not None
+    if counts.get("bones") and not wanted:  # cloud and trails would lie over the skin
+        excluded.show(scene, POINTS_KEY, False)
     if options.studio:
         _add_studio(scene, collection, body, contents)
     mark_doubtful(scene, contents.doubtful)
@@ -405,7 +408,7 @@ def _add_body(
             other.hide_render = True
         skin_object.hide_set(skin_object is not shown)
         shown[layers.LAYER_KEY] = layers.SKIN
-        metaballs.show(bpy.context.scene, False)
+        excluded.show(bpy.context.scene, metaballs.COLLECTION_KEY, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma, stand)

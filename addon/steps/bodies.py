@@ -16,7 +16,8 @@ from ..operators import control_rig
 from ..panels import expanded, sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
-from ..scene import footage_plane, layers, metaballs, standing
+from ..scene import excluded, footage_plane, layers, metaballs, standing
+from ..scene.options import POINTS_KEY
 from . import check, states, watch
 from .person import draw_person
 from .states import Fix, Status
@@ -218,7 +219,9 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
         layout.prop(context.scene.tricap, "render_footage")
     if layers.parts(context.scene):
         layout.row(align=True).prop(context.scene.tricap, "body_layer", expand=True)
-    if metaballs.exist(context.scene):
+    if edited is not None and excluded.exist(context.scene, POINTS_KEY):
+        layout.prop(context.scene.tricap, "show_measured")
+    if excluded.exist(context.scene, metaballs.COLLECTION_KEY):
         layout.prop(context.scene.tricap, "show_metaballs")
 
 

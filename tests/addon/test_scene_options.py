@@ -177,15 +177,30 @@ def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: 
 
 
 def test_one_skin_is_shown_and_metaballs_are_excluded_behind_it(empty: ModuleType, small_run: SmallRun) -> None:
-    from tricap.addon.scene import metaballs
+    from tricap.addon.scene import excluded, metaballs
     from tricap.addon.scene.build import build_scene
 
     build_scene(small_run.out)
     shown = {o.name for o in empty.data.objects if o.type in ("MESH", "META") and o.name.startswith(("Skin", "Flesh")) and o.visible_get()}
     assert shown == {"Skin"} and not empty.data.objects["Skin"].hide_render and empty.data.objects["Flesh"].hide_render
-    metaballs.show(empty.context.scene, True)
+    excluded.show(empty.context.scene, metaballs.COLLECTION_KEY, True)
     flesh = empty.data.objects["Flesh"].evaluated_get(empty.context.evaluated_depsgraph_get())
     assert len(flesh.to_mesh().vertices) > 100
+
+
+def test_cloud_and_trajectories_step_back_behind_the_skin(blender: ModuleType, small_run: SmallRun) -> None:
+    """They would lie over it. The switch shows them; who asks for arrows of velocities sees them at once."""
+    from tricap.addon.scene.build import build_scene
+
+    scene, measured = blender.context.scene, ("Cloud", "Trajectories")
+    build_scene(small_run.out)
+    assert not scene.tricap.show_measured and not any(name in blender.context.view_layer.objects for name in measured)
+    scene.tricap.show_measured = True
+    assert all(blender.data.objects[name].visible_get() and name in blender.context.view_layer.objects for name in measured)
+    scene.tricap.show_measured = False
+    assert not any(name in blender.context.view_layer.objects for name in measured)
+    build_scene(small_run.out, options=SceneOptions(arrows=True))
+    assert scene.tricap.show_measured and blender.data.objects["Velocities"].visible_get()
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
