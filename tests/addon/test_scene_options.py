@@ -190,7 +190,7 @@ def test_one_skin_is_shown_and_metaballs_are_excluded_behind_it(empty: ModuleTyp
 
 def test_cloud_and_trajectories_step_back_behind_the_skin(blender: ModuleType, small_run: SmallRun) -> None:
     """They would lie over it. The switch shows them; who asks for arrows of velocities sees them at once."""
-    from tricap.addon.scene.build import build_scene
+    from tricap.addon.scene.build import SceneOptions, build_scene
 
     scene, measured = blender.context.scene, ("Cloud", "Trajectories")
     build_scene(small_run.out)
@@ -201,6 +201,29 @@ def test_cloud_and_trajectories_step_back_behind_the_skin(blender: ModuleType, s
     assert not any(name in blender.context.view_layer.objects for name in measured)
     build_scene(small_run.out, options=SceneOptions(arrows=True))
     assert scene.tricap.show_measured and blender.data.objects["Velocities"].visible_get()
+
+
+def test_points_and_trails_are_wide_enough_for_the_camera(blender: ModuleType, small_run: SmallRun) -> None:
+    """Where a person is far away, points of 1.5 mm are a fraction of a pixel, and nobody sees them."""
+    from tricap.addon.scene import cloud, trajectories
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out)
+    camera, elbow = small_run.rig["C"], np.array([small_run.joints_m["elbow.R"][len(FRAMES) // 2]])
+    pixel_m = cloud.pixel_size_m(camera, elbow)
+    assert pixel_m == pytest.approx(camera.to_camera(elbow)[0, 2] / 390, rel=0.03) and pixel_m > 4e-3
+    blender.context.scene.frame_set(FRAMES[-1])
+    for name, px in (("Cloud", cloud.POINT_RADIUS_PX), ("Trajectories", trajectories.TRAIL_RADIUS_PX)):
+        group = blender.data.objects[name].modifiers[0].node_group
+        assert group.interface.items_tree["Radius"].default_value == pytest.approx(px * pixel_m, rel=0.03)
+    blender.context.scene.tricap.show_measured = True
+    trails, widths = blender.data.objects["Trajectories"], []
+    for radius_m in (0.0, 0.01):
+        trails.modifiers.clear()
+        trails.modifiers.new("Trail", "NODES").node_group = trajectories.trail_group(trails.data.materials[0], radius_m=radius_m)
+        widths.append(world_vertices(blender, trails))
+    assert np.linalg.norm(widths[1] - widths[0], axis=1) == pytest.approx(0.01, rel=0.2)
+    assert cloud.pixel_size_m(camera, np.zeros((0, 3))) == 0.0 and trajectories.trail_radius_m(0.0) == trajectories.TRAIL_RADIUS_M
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:

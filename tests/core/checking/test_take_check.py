@@ -377,7 +377,10 @@ def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int
     found = picture_findings(Survey(frames=range(12), energy=energy, spread=like, bright=3 * like, white=0 * like), ("R",))
     assert [finding.harmless for finding in found] == ([] if harmless is None else [harmless])
     for finding in found:
-        assert str(finding).startswith("Note: " if harmless else "Wrong: ") and finding.figures == {"frames": len(repeats), "first": repeats[0]}
+        assert str(finding).startswith("Note: " if harmless else "Wrong: ") and finding.figures == {
+            "frames": len(repeats),
+            "first": repeats[0],
+        }
 
 
 def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
