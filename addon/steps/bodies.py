@@ -178,7 +178,8 @@ def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) 
     asked = watch.current(context.scene).states["body"].click
     if asked is not None:
         button = primary(layout, "tricap.click_joints", True, icon="RESTRICT_SELECT_OFF", text=f"Click {asked[0]} in Frame {asked[1]}")
-        button.only, button.frame = asked
+        button.needed, button.frame = asked
+        sentence(layout, context, "After it you may click more joints. With three of shoulders and hips, the fit asks no more.", "INFO")
     _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")

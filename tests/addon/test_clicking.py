@@ -367,11 +367,12 @@ def _holds(t: np.ndarray, p: np.ndarray) -> bool:
 
 
 def test_the_order_of_the_joints(blender: ModuleType) -> None:
-    joints_of = module("clicking.click_session").joints_of
+    joints_of, needed_first = (getattr(module("clicking.click_session"), name) for name in ("joints_of", "needed_first"))
     from tricap.core.body.model_file import read_model
 
     every = read_model("full").skeleton.joint_names
     asked = joints_of(every)
+    assert needed_first(["head", "shoulder.R", "hip.R", "knee.R"], "knee.R") == ["knee.R", "shoulder.R", "hip.R", "head"]
     assert asked[0] == "head" and "chest" not in asked and "crown" not in asked and "chest" in joints_of(every, hidden=True)
     assert joints_of(read_model("leg.L").skeleton.joint_names) == ["hip.L", "knee.L", "ankle.L"]
 
