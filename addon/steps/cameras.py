@@ -87,7 +87,9 @@ def show_cameras(operator: bpy.types.Operator, context: bpy.types.Context) -> No
 
 
 def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-    """Make these the project's cameras, list the views in their order, and set the lenses of the clips. `bar`: frames and ends [m] of the wand, if they come from one.
+    """Make these the project's cameras, list the views in their order, and set the lenses of the clips.
+
+    `bar`: frames and ends [m] of the wand, if they come from one.
 
     Raises:
         InputError: a view has no camera of its name, or the project's folder cannot be written to.

@@ -18,8 +18,8 @@ MOST_TURNED_DEG = 60.0  # of a camera from the mean direction of all: beyond, th
 def names_for_views(rig: Rig, views: Sequence[str]) -> dict[str, str]:
     """The view of each camera whose name has to change, by the camera's name; empty if every view has a camera of its name.
 
-    Names that differ in upper and lower case only, words for the same side (left, L), and names with the same number or word besides what
-    the others have, too (cam_2 and 2, cam02), belong together. Where that leaves any open, as many cameras as views are taken in their order.
+    Names that differ in upper and lower case only, words for the same side (left, L), and names with the same number or word besides those
+    that all have (cam_2, 2 and cam02), belong together. Where that leaves any open, as many cameras as views are taken in their order.
 
     Raises:
         InputError: there are fewer cameras than views, or more and their names do not show which are meant.
@@ -40,7 +40,7 @@ def names_for_views(rig: Rig, views: Sequence[str]) -> dict[str, str]:
 
 
 def from_left_to_right(rig: Rig) -> list[str]:
-    """The names of the cameras from left to right, as seen from where they look; as they are listed where their directions differ too much."""
+    """The names of the cameras from left to right around what they look at; as they are listed where they look in too different directions."""
     turned = np.array([camera.R_cam_world for camera in rig.cameras])  # rows: the axes x (right), y (down), z (forward) in the world
     right, _, forward = turned.mean(axis=0)
     length = float(np.linalg.norm(forward))
