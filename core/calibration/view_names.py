@@ -40,7 +40,7 @@ def names_for_views(rig: Rig, views: Sequence[str]) -> dict[str, str]:
 
 
 def from_left_to_right(rig: Rig) -> list[str]:
-    """The names of the cameras from left to right around what they look at; as they are listed where they look in too different directions."""
+    """The names of the cameras from left to right around what they look at; as listed where they look in too different directions."""
     turned = np.array([camera.R_cam_world for camera in rig.cameras])  # rows: the axes x (right), y (down), z (forward) in the world
     right, _, forward = turned.mean(axis=0)
     length = float(np.linalg.norm(forward))
