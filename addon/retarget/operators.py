@@ -58,7 +58,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Read both rigs and, from an armature, its motion."""
         props = context.scene.tricap_retarget
         settings, feet = snapshot(props.settings, RetargetSettings), snapshot(props.feet, FeetSettings)
-        self._target = armature_of(self.target, props.target, "target")
+        self._target = armature_of(self.target, properties.target_of(context.scene), "target")
         moving = None if self.file else armature_of(self.source, props.source, "source", needed=not props.file)
         if moving is not None:
             apply.check_distinct(moving, self._target)
@@ -90,6 +90,7 @@ class Retarget(JobOperator, bpy.types.Operator):
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused_mapping]), *outcome.notes]
         props.last_export, props.export = "", self._target
+        props.target = props.target or self._target
         props.last = "\n".join([str(outcome.figures), *notes])
         for note in notes:
             self.report({"INFO"}, note)
@@ -126,8 +127,9 @@ class Preview(TellingOperator, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Add the constraints."""
         props = context.scene.tricap_retarget
-        source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
+        source, target = armature_of("", props.source, "source"), armature_of("", properties.target_of(context.scene), "target")
         apply.check_distinct(source, target)
+        props.target = target
         rig, mapped = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
         count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, mapped.mapped)
         return f"{count} bones of {target.name} follow {source.name}."

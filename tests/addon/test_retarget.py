@@ -190,8 +190,12 @@ def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleTy
     former = target.animation_data.action.name
     kept = [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points]
     props = bpy.context.scene.tricap_retarget
-    props.source, props.target = source, target
-    assert bpy.ops.tricap.retarget_find_map() == {"FINISHED"} and len(props.rows) == 20
+    props.source, other = source, armature(person(), "Other")
+    with pytest.raises(RuntimeError, match="Choose an armature as the target"):
+        bpy.ops.tricap.retarget()
+    bpy.data.objects.remove(other)
+    assert props.target is None and bpy.ops.tricap.retarget_find_map() == {"FINISHED"} and len(props.rows) == 20
+    assert props.target == target, "the only other armature"
     assert bpy.ops.tricap.retarget() == {"FINISHED"}
     assert target.animation_data.action.name != former and "limb directions" in props.last
     assert [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points] == kept
