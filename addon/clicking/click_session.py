@@ -155,10 +155,10 @@ class ClickSession:
         self.propose()
 
     def go_to_next(self, from_index: int) -> None:
-        """Make the first joint from this index on that is not clicked in two views the current one; after the last, the first that is
+        """Make the first joint from this index on that is neither clicked in two views nor skipped the current one; after the last, the first that is
         missing. All are done when each is clicked in two views or was skipped."""
         self.index = from_index
-        while self.name and self._is_complete(self.name):
+        while self.name and (self._is_complete(self.name) or self.name in self._skipped):
             self.index += 1
         if not self.name and not self.endless:
             self.index = next((i for i, name in enumerate(self.names) if name in self.missing()), len(self.names))

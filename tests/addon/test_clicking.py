@@ -129,6 +129,18 @@ def test_a_session_ends_when_every_joint_is_clicked_twice_or_skipped(session: An
     assert session.back() and session.missing() == {first: 1}
 
 
+def test_a_skipped_joint_is_not_asked_for_in_the_second_round(session: Any) -> None:
+    assert session.names == ["shoulder.R", "elbow.R", "wrist.R"]
+    session.accept()
+    session.skip()
+    session.accept()
+    assert session.name == "shoulder.R", "left without a click, so that it is asked for again"
+    session.accept()
+    assert session.name == "wrist.R"
+    session.go_to("elbow.R")
+    assert session.name == "elbow.R", "on request it can be clicked all the same"
+
+
 def test_a_click_near_the_proposal_takes_it(session: Any, truth: Truth) -> None:
     camera = dict(zip(session.views, session.finder.cameras))
     X = sleeve_point(session, truth, 0)
