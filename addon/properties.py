@@ -148,7 +148,7 @@ def register() -> None:
             description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
         ),
         "show_measured": bpy.props.BoolProperty(
-            name="Cloud and Trajectories",
+            name="Cloud and Trails",
             options=set(),
             get=lambda group: excluded.shown(group.id_data, POINTS_KEY),
             set=lambda group, value: excluded.show(group.id_data, POINTS_KEY, value),

@@ -155,8 +155,8 @@ class ClickSession:
         self.propose()
 
     def go_to_next(self, from_index: int) -> None:
-        """Make the first joint from this index on that is neither clicked in two views nor skipped the current one; after the last, the first that is
-        missing. All are done when each is clicked in two views or was skipped."""
+        """Make the first joint from this index on that is neither clicked in two views nor skipped the current one; after the last, the
+        first that is missing. All are done when each is clicked in two views or was skipped."""
         self.index = from_index
         while self.name and (self._is_complete(self.name) or self.name in self._skipped):
             self.index += 1

@@ -82,7 +82,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Write the action and report how good it is."""
         props = context.scene.tricap_retarget
         preview.remove_preview(self._target)
-        beside = begun_at_rest(result.result) if props.place == "SIDE" else result.result
+        beside = begun_at_rest(result.result, result.source) if props.place == "SIDE" else result.result
         outcome = apply.apply(self._target, result.source, self._mapped_target, beside, self._name, props.tolerance_deg)
         if self._edited is not None:
             saved_maps.keep(read_rig(self._target), self._edited, self._target.name)

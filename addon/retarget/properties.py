@@ -29,7 +29,7 @@ EXPORTED = (
 
 
 PLACES = (
-    ("SIDE", "Side by Side", "The target begins where it stands"),
+    ("SIDE", "Side by Side", "The target begins where it stands, or beside the source if it stands in it"),
     ("SOURCE", "In Place", "The target moves where the source does"),
 )
 

@@ -219,7 +219,7 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
     if next(footage_plane.screens(context.scene), None) is not None:
         layout.prop(context.scene.tricap, "render_footage")
     if layers.parts(context.scene):
-        layout.row(align=True).prop(context.scene.tricap, "body_layer", expand=True)
+        layout.prop(context.scene.tricap, "body_layer")
     if edited is not None and excluded.exist(context.scene, POINTS_KEY):
         layout.prop(context.scene.tricap, "show_measured")
     if excluded.exist(context.scene, metaballs.COLLECTION_KEY):

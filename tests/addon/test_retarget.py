@@ -178,8 +178,13 @@ def test_an_action_is_a_source_and_comes_back(empty: ModuleType) -> None:
 def it_begins_where_it_stands(bpy: ModuleType, target: Any, props: Any) -> None:
     hips = next(row.bones.partition(",")[0] for row in props.rows if row.role == "hips")
     bpy.context.scene.frame_set(int(target.animation_data.action.frame_range[0]))
-    now, rest = target.pose.bones[hips].matrix.translation, target.data.bones[hips].head_local
-    assert props.place == "SIDE" and (now - rest).xy.length < 1e-4
+    rest = target.data.bones[hips].head_local
+    assert props.place == "SIDE" and (target.pose.bones[hips].matrix.translation - rest).xy.length == pytest.approx(1.0, abs=1e-4), (
+        "beside the source, in which it stands"
+    )
+    target.location.x = 2.0
+    assert bpy.ops.tricap.retarget() == {"FINISHED"}
+    assert (target.pose.bones[hips].matrix.translation - rest).xy.length < 1e-4
 
 
 def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleType) -> None:
