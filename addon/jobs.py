@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import bpy
 
+from ..core.fitting.inputs.start_joints import NeedsClick
 from ..core.foundation.errors import InputError, sentence_of
 from ..core.foundation.progress import Cancelled, Monitor, time_text
 from ..core.foundation.threads import one_thread_in_linear_algebra
@@ -235,7 +236,7 @@ class JobOperator:
             return {"CANCELLED"}
         job.run()
         job.advance(lambda: self.in_steps(context, job.result, job.monitor), float("inf"))
-        return self._conclude(context, job)
+        return self._conclude(context, job, asked="ERROR")
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event | None) -> set[str]:
         """Modal driver: start the thread and watch it."""
@@ -270,7 +271,7 @@ class JobOperator:
             self._show(context)
             return {"RUNNING_MODAL" if event.type == "ESC" else "PASS_THROUGH"}
         self.clear(context)
-        return self._conclude(context, self.job)
+        return self._conclude(context, self.job, asked="WARNING")
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator (another file, quitting)."""
@@ -288,7 +289,8 @@ class JobOperator:
             self.report({"ERROR"}, reason)  # type: ignore[attr-defined]
             return None
 
-    def _conclude(self, context: bpy.types.Context, job: Job) -> set[str]:
+    def _conclude(self, context: bpy.types.Context, job: Job, asked: str) -> set[str]:
+        """`asked`: how a question is reported: to scripts as an error; the window has a button for it, which an error would cover."""
         error, ended = job.error, {"CANCELLED"}
         if error is None:
             try:
@@ -299,16 +301,16 @@ class JobOperator:
                 error, job.trace = bug, traceback.format_exc()
         if error is not None:
             self.after_error(context)
-            self._report_error(job, error)
+            self._report_error(job, error, asked)
         stopped = str(error) if isinstance(error, Cancelled) else ""
         failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _message(error)
         for listener in get_session().on_job_end:
             listener(context, job.step, failed, stopped, error)
         return ended
 
-    def _report_error(self, job: Job, error: BaseException) -> None:
+    def _report_error(self, job: Job, error: BaseException, asked: str) -> None:
         if (reason := sentence_of(error)) is not None:
-            self.report({"ERROR"}, reason)  # type: ignore[attr-defined]
+            self.report({asked if isinstance(error, NeedsClick) else "ERROR"}, reason)  # type: ignore[attr-defined]
         elif isinstance(error, (Cancelled, KeyboardInterrupt)):
             self.report({"WARNING"}, f"{error} {self.if_stopped}".strip())  # type: ignore[attr-defined]
         else:

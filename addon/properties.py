@@ -15,7 +15,8 @@ from ..core.foundation import settings as knobs
 from ..core.run.settings import SETTINGS, settings_of
 from . import take_properties
 from .editing import foot_lock, uncertainty
-from .scene import footage_plane, layers, metaballs, standing
+from .scene import excluded, footage_plane, layers, metaballs, standing
+from .scene.options import POINTS_KEY
 from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -142,9 +143,16 @@ def register() -> None:
         "show_metaballs": bpy.props.BoolProperty(
             name="Metaballs",
             options=set(),
-            get=lambda group: metaballs.shown(group.id_data),
-            set=lambda group, value: metaballs.show(group.id_data, value),
+            get=lambda group: excluded.shown(group.id_data, metaballs.COLLECTION_KEY),
+            set=lambda group, value: excluded.show(group.id_data, metaballs.COLLECTION_KEY, value),
             description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
+        ),
+        "show_measured": bpy.props.BoolProperty(
+            name="Cloud and Trails",
+            options=set(),
+            get=lambda group: excluded.shown(group.id_data, POINTS_KEY),
+            set=lambda group, value: excluded.show(group.id_data, POINTS_KEY, value),
+            description="Show the measured points and their trails with the body. They are never rendered",
         ),
         "body_layer": bpy.props.EnumProperty(
             name="Layer",

@@ -20,6 +20,7 @@ from .finder import Answer, Finder, Question
 ARMS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("shoulder", "elbow", "wrist"))
 LEGS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("hip", "knee", "ankle", "toe"))
 ORDER = ("head", "neck", *ARMS, "pelvis", *LEGS)
+TRUNK = ("shoulder.R", "shoulder.L", "hip.R", "hip.L")
 HIDDEN = ("chest", "spine", "clavicle.R", "clavicle.L")  # inside the trunk: hard to locate from outside
 
 
@@ -154,10 +155,10 @@ class ClickSession:
         self.propose()
 
     def go_to_next(self, from_index: int) -> None:
-        """Make the first joint from this index on that is not clicked in two views the current one; after the last, the first that is
-        missing. All are done when each is clicked in two views or was skipped."""
+        """Make the first joint from this index on that is neither clicked in two views nor skipped the current one; after the last, the
+        first that is missing. All are done when each is clicked in two views or was skipped."""
         self.index = from_index
-        while self.name and self._is_complete(self.name):
+        while self.name and (self._is_complete(self.name) or self.name in self._skipped):
             self.index += 1
         if not self.name and not self.endless:
             self.index = next((i for i, name in enumerate(self.names) if name in self.missing()), len(self.names))
@@ -268,6 +269,11 @@ def _select(clip: bpy.types.MovieClip, track: bpy.types.MovieTrackingTrack) -> N
 def joints_of(model_joints: Sequence[str], *, hidden: bool = False) -> list[str]:
     """The joints of a model in the order in which they are clicked; those inside the trunk come last, if at all."""
     return [name for name in (*ORDER, *(HIDDEN if hidden else ())) if name in model_joints]
+
+
+def needed_first(names: Sequence[str], needed: str) -> list[str]:
+    """The joint that a fit asks for, then those of the trunk, which spare further questions, then all others."""
+    return list(dict.fromkeys([needed, *(name for name in TRUNK if name in names), *names]))
 
 
 def free_seed_names(clips: Mapping[str, bpy.types.MovieClip], frame: int, count: int = 200) -> list[str]:

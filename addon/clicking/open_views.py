@@ -7,6 +7,7 @@ import bpy
 from ...core.foundation.errors import InputError
 from .. import clicks, project
 from ..overlay import canvas
+from ..session import get_session
 
 NAME, REVIEW = "Tricap Clicks", "Tricap Review"
 OURS = (NAME, REVIEW)
@@ -83,6 +84,8 @@ class BackToSteps(bpy.types.Operator):
     bl_idname = "tricap.back_to_steps"
     bl_label = "Back to Steps"
 
+    run: bpy.props.BoolProperty(name="Run", options={"SKIP_SAVE"}, description="Also run the remaining steps")  # type: ignore[valid-type]
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only in the views' workspace."""
@@ -98,14 +101,21 @@ class BackToSteps(bpy.types.Operator):
             self.report({"ERROR"}, "There is no other workspace. Add one with the + at the top of the window.")
             return {"CANCELLED"}
         context.window.workspace = back
+        if self.run:
+            bpy.ops.tricap.run("INVOKE_DEFAULT")
         return {"FINISHED"}
 
 
 def draw_back(header: bpy.types.Header, context: bpy.types.Context) -> None:
-    """The button Back to Steps in the header of the first view."""
+    """The buttons Back to Steps and Run Remaining Steps in the header of the first view."""
     mine = canvas.clip_areas(context.window)
-    if BackToSteps.poll(context) and mine and context.area == min(mine, key=lambda a: (-a.y, a.x)):
-        header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
+    if not BackToSteps.poll(context) or not mine or context.area != min(mine, key=lambda a: (-a.y, a.x)):
+        return
+    header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
+    session = get_session()
+    now = session.file.step_states.get(context.scene.name_full)
+    if now is not None and now.can_run and session.job is None:
+        header.layout.operator("tricap.back_to_steps", icon="FF", text="Run Remaining Steps").run = True
 
 
 def lay_out_soon(window: bpy.types.Window, workspace: str, layout: Callable[[], Iterator[str]]) -> None:

@@ -16,7 +16,7 @@ from ..overlay import canvas
 from ..panels import show_status
 from ..session import get_session
 from . import draw
-from .click_session import ClickSession, free_seed_names, joints_of
+from .click_session import ClickSession, free_seed_names, joints_of, needed_first
 from .finder import Finder
 
 TICK_S, SNAP_PX = 0.05, 6.0
@@ -159,7 +159,9 @@ class ClickOperator:
         return self.session.view_of(canvas.clip_of(area))
 
     def _show(self, context: bpy.types.Context) -> None:
-        show_status(context, f"{self.session.name}    {KEYS}")
+        needed = getattr(self, "needed", "")  # of ClickJoints alone
+        optional = " (optional: the buttons above the first view go on)" if needed not in ("", self.session.name) else ""
+        show_status(context, f"{self.session.name}{optional}    {KEYS}")
         canvas.redraw_clips(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
@@ -168,8 +170,9 @@ class ClickOperator:
         if not session.changed or not session.has_all_clips:
             return {"FINISHED" if session.changed else "CANCELLED"}
         done = len(session.names) - len(session.missing(skipped=True))
-        result = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two or more views."
-        self.report({"INFO"}, f"{result}{_what_is_missing(session)} Press Back to Steps, above the first view.")  # type: ignore[attr-defined]
+        result = f"Frame {session.frame}: {done} of {len(session.names)} clicked in two or more views."
+        missing = "" if getattr(self, "needed", "") else _what_is_missing(session)
+        self.report({"INFO"}, f"{result}{missing} Go on with the buttons above the first view.")  # type: ignore[attr-defined]
         return {"FINISHED"}
 
 
@@ -189,6 +192,9 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     only: bpy.props.StringProperty(name="Only", description="Click only this joint. Empty: all joints of the body")  # type: ignore[valid-type]
+    needed: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Needed", options={"SKIP_SAVE"}, description="Begin with this joint; all others are optional, those of the trunk first"
+    )
     frame: bpy.props.IntProperty(  # type: ignore[valid-type]
         name="Frame", default=-1, min=-1, options={"SKIP_SAVE"}, description="In this frame, as a keyframe. −1: the scene's current one"
     )
@@ -211,7 +217,8 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
         """The joints of the chosen model."""
         if self.only:
             return [self.only]
-        return joints_of(model_joints(context.scene), hidden=self.hidden)
+        names = joints_of(model_joints(context.scene), hidden=self.hidden)
+        return needed_first(names, self.needed) if self.needed else names
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Clicking needs a window."""

@@ -38,7 +38,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.4
         row.operator("tricap.click_joints", icon="RESTRICT_SELECT_OFF")
-        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Surface Seeds (Optional)")
+        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Surface Seeds")
         self._draw_frame(layout, scene)
         self._draw_joints(layout, scene)
 
@@ -47,8 +47,8 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         if scene.frame_current == first:
             layout.label(text=f"Frame {first}: click frame", icon="KEYTYPE_KEYFRAME_VEC")
         else:
-            layout.label(text=f"Frame {scene.frame_current}: clicks are a keyframe", icon="KEYTYPE_EXTREME_VEC")
-            layout.operator("tricap.go_to_frame", text=f"Go to Click Frame ({first})").frame = first
+            layout.label(text=f"Frame {scene.frame_current}: keyframe", icon="KEYTYPE_EXTREME_VEC")
+            layout.operator("tricap.go_to_frame", text=f"Go to Frame {first}").frame = first
 
     def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         try:
@@ -59,7 +59,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         found = {n: [v for v, clip in clips.items() if clicks.get_click(clip, n, scene.frame_current) is not None] for n in names}
         many = len(names) > MOST_UNFOLDED
         header, inside = layout.panel(f"tricap_clip_joints_{'many' if many else 'few'}", default_closed=many)
-        header.label(text=f"Joints ({sum(len(at) > 1 for at in found.values())} of {len(names)} clicked)")
+        header.label(text=f"Joints ({sum(len(at) > 1 for at in found.values())} of {len(names)})")
         if inside is None:
             return
         grid = inside.column(align=True)

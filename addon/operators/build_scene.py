@@ -16,6 +16,7 @@ from .. import folders
 from ..jobs import JobOperator
 from ..scene import armature
 from ..scene.cloud import COLOURS
+from ..scene.looking import show_all_frames
 from ..scene.options import DEFAULTS, SceneOptions
 from ..scene.rest_pose import POSES
 
@@ -180,10 +181,7 @@ def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.t
         region = next(r for r in area.regions if r.type == "WINDOW")
         with context.temp_override(area=area, region=region):
             bpy.ops.view3d.view_selected()
-    for area in (a for a in context.window.screen.areas if a.type == "DOPESHEET_EDITOR"):
-        region = next(r for r in area.regions if r.type == "WINDOW")
-        with context.temp_override(area=area, region=region):
-            bpy.ops.action.view_all()
+    show_all_frames(context)
 
 
 def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:

@@ -24,7 +24,7 @@ def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Pat
         InputError: there is no target, or the file is no mapping for it.
     """
     props = context.scene.tricap_retarget
-    target = armature_of("", props.target, "target")
+    target = props.target = armature_of("", properties.target_of(context.scene), "target")
     rig, begins = read_rig(target), not props.rows or props.rows_of != target
     known = saved_maps.found_again(rig) if file is None and begins else None
     rig_map = known or apply.map_of(rig, file, controls=True)

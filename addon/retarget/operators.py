@@ -58,7 +58,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Read both rigs and, from an armature, its motion."""
         props = context.scene.tricap_retarget
         settings, feet = snapshot(props.settings, RetargetSettings), snapshot(props.feet, FeetSettings)
-        self._target = armature_of(self.target, props.target, "target")
+        self._target = armature_of(self.target, properties.target_of(context.scene), "target")
         moving = None if self.file else armature_of(self.source, props.source, "source", needed=not props.file)
         if moving is not None:
             apply.check_distinct(moving, self._target)
@@ -82,7 +82,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Write the action and report how good it is."""
         props = context.scene.tricap_retarget
         preview.remove_preview(self._target)
-        beside = begun_at_rest(result.result) if props.place == "SIDE" else result.result
+        beside = begun_at_rest(result.result, result.source) if props.place == "SIDE" else result.result
         outcome = apply.apply(self._target, result.source, self._mapped_target, beside, self._name, props.tolerance_deg)
         if self._edited is not None:
             saved_maps.keep(read_rig(self._target), self._edited, self._target.name)
@@ -90,6 +90,7 @@ class Retarget(JobOperator, bpy.types.Operator):
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused_mapping]), *outcome.notes]
         props.last_export, props.export = "", self._target
+        props.target = props.target or self._target
         props.last = "\n".join([str(outcome.figures), *notes])
         for note in notes:
             self.report({"INFO"}, note)
@@ -126,8 +127,9 @@ class Preview(TellingOperator, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Add the constraints."""
         props = context.scene.tricap_retarget
-        source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
+        source, target = armature_of("", props.source, "source"), armature_of("", properties.target_of(context.scene), "target")
         apply.check_distinct(source, target)
+        props.target = target
         rig, mapped = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
         count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, mapped.mapped)
         return f"{count} bones of {target.name} follow {source.name}."

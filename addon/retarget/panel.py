@@ -62,6 +62,9 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             row.prop(props, "up")
             row.prop(props, "unit")
     column.prop(props, "target")
+    target = properties.target_of(context.scene)
+    if target is not None and props.target is None:
+        sentence(layout, context, f"“{target.name}” is the target, as the only other armature.", "INFO")
     header, body = layout.panel("tricap_retarget_map", default_closed=not props.rows)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (automatic)")
     if body is not None:
@@ -78,7 +81,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     layout.prop(props, "strip")
     buttons = layout.row(align=True)
     buttons.scale_y = 1.3
-    buttons.enabled = props.target is not None and (props.source is not None or bool(props.file))
+    buttons.enabled = target is not None and (props.source is not None or bool(props.file))
     buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
     buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
     if bpy.data.collections.get(preview.NAME) is not None:

@@ -15,6 +15,8 @@ from ...core.motion.retarget.mapping import RigMap, control_rig_of
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.retarget.roles import ROLES
 from ..properties import group_class
+from ..scene.armature import SNAPS_KEY
+from ..scene.standing import DOFS_KEY
 
 AUTOMATIC = "USUAL"  # the identifier in saved files
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -27,7 +29,7 @@ EXPORTED = (
 
 
 PLACES = (
-    ("SIDE", "Side by Side", "The target begins where it stands"),
+    ("SIDE", "Side by Side", "The target begins where it stands, or beside the source if it stands in it"),
     ("SOURCE", "In Place", "The target moves where the source does"),
 )
 
@@ -124,6 +126,15 @@ class Retargeting(bpy.types.PropertyGroup):
     )
     last: bpy.props.StringProperty()  # type: ignore[valid-type]  # figures and notes of the last retargeting
     last_export: bpy.props.StringProperty()  # type: ignore[valid-type]  # what was exported since
+
+
+def target_of(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The target that is chosen; without one the only armature of the scene that can be one."""
+    props = scene.tricap_retarget
+    if props.target is not None:
+        return props.target
+    others = [o for o in scene.objects if o.type == "ARMATURE" and o != props.source and DOFS_KEY not in o.data and SNAPS_KEY not in o]
+    return others[0] if len(others) == 1 else None
 
 
 def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object, source: RigMap | None = None) -> None:

@@ -24,13 +24,13 @@ from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
-from .cloud import CloudPoints, add_cloud
+from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
+from .cloud import CloudPoints, add_cloud, pixel_size_m
 from .contents import Contents, read_contents
 from .looking import look_at
-from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, SceneOptions
+from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, POINTS_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
-from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser
+from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser, trail_radius_m
 
 COLLECTION = "Tricap"
 MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
@@ -85,7 +85,7 @@ def write_scene(
     counts: dict[str, int] = {}
     counts["cameras"] = _add_cameras(scene, _part(collection, "Cameras"), contents, opened, warnings)
     measured = _part(collection, "Measured")
-    measured.hide_render = True
+    measured.hide_render = measured[POINTS_KEY] = True
     counts["cloud points"] = _add_cloud(measured, contents, options, warnings)
     if contents.trajectories is not None:
         counts["trajectories"] = _add_trajectories(measured, contents, contents.trajectories, options, warnings)
@@ -93,6 +93,9 @@ def write_scene(
     counts |= _add_body(body, contents, warnings, options, blend)
     if surface is not None:
         skin.add_implicit(measured, *surface, potential_named(options.field))
+    wanted = options.arrows or options.implicit or contents.raw is not None
+    if counts.get("bones") and not wanted:  # cloud and trails would lie over the skin
+        excluded.show(scene, POINTS_KEY, False)
     if options.studio:
         _add_studio(scene, collection, body, contents)
     mark_doubtful(scene, contents.doubtful)
@@ -307,8 +310,16 @@ def _add_cloud(collection: bpy.types.Collection, contents: Contents, options: Sc
         warnings.append(f"The scene shows one in {every} of {whole} cloud points to stay responsive; {where} has all.")
     shown = [_cloud_points(frame, ply, every, contents) for frame, ply in contents.clouds.items()]
     if shown:
-        _name_segments(add_cloud(collection, shown, options.colour), contents)
+        _name_segments(add_cloud(collection, shown, options.colour, _pixel_m(contents)), contents)
     return sum(len(cloud.xyz_m) for cloud in shown)
+
+
+def _pixel_m(contents: Contents) -> float:
+    """How large the pixels of the scene's camera are at the person; 0 without footage or cloud."""
+    clouds = [ply.xyz_m for ply in contents.clouds.values() if len(ply.xyz_m)]
+    if contents.footage is None or not clouds:
+        return 0.0
+    return pixel_size_m(contents.footage.rig.cameras[contents.footage.take.reference], clouds[len(clouds) // 2])
 
 
 def _cloud_points(frame: int, ply: Ply, every: int, contents: Contents) -> CloudPoints:
@@ -334,12 +345,13 @@ def _add_trajectories(
     shown, every = sparser({**arrays, "segment": contents.prepared.track_segment}, options.most_points)
     if every > 1:
         warnings.append(f"The scene shows one in {every} of {arrays['xyz_m'].shape[1]} trajectories to stay responsive.")
-    _name_segments(add_trajectories(collection, shown), contents)
+    radius_m = trail_radius_m(_pixel_m(contents))
+    _name_segments(add_trajectories(collection, shown, radius_m=radius_m), contents)
     if options.arrows:
-        add_arrows(collection, shown)
-        add_bends(collection, shown)
+        add_arrows(collection, shown, radius_m)
+        add_bends(collection, shown, radius_m)
     if contents.raw is not None:
-        add_removed(collection, contents.raw, options.most_points)
+        add_removed(collection, contents.raw, options.most_points, radius_m)
     return int(shown["xyz_m"].shape[1])
 
 
@@ -405,7 +417,7 @@ def _add_body(
             other.hide_render = True
         skin_object.hide_set(skin_object is not shown)
         shown[layers.LAYER_KEY] = layers.SKIN
-        metaballs.show(bpy.context.scene, False)
+        excluded.show(bpy.context.scene, metaballs.COLLECTION_KEY, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma, stand)

@@ -1,4 +1,4 @@
-"""Where the 3-D views of a file look that the command writes: at the body, not at the origin."""
+"""Where the 3-D views of a file look that the command writes: at the body, not at the origin. What the timelines show: all frames."""
 
 from itertools import chain
 
@@ -18,3 +18,12 @@ def look_at(body: bpy.types.Object) -> None:
         view = space.region_3d
         if view is not None:
             view.view_location, view.view_distance = Vector((low + high) / 2), DISTANCES * float((high - low).max())
+
+
+def show_all_frames(context: bpy.types.Context) -> None:
+    """Let the timelines of the window show the frames of the scene."""
+    if context.window is None or bpy.app.background:
+        return
+    for area in (a for a in context.window.screen.areas if a.type == "DOPESHEET_EDITOR"):
+        with context.temp_override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
+            bpy.ops.action.view_all()

@@ -17,8 +17,6 @@ Blender polygonises visible and hidden metaballs alike in every frame, which for
 else in the scene. They are therefore in a collection of their own, which the view layers exclude as long as nobody looks at them.
 """
 
-from collections.abc import Iterator
-
 import bpy
 import numpy as np
 
@@ -42,33 +40,6 @@ def add_collection(parent: bpy.types.Collection) -> bpy.types.Collection:
     collection[COLLECTION_KEY] = True
     parent.children.link(collection)
     return collection
-
-
-def exist(scene: bpy.types.Scene) -> bool:
-    """Whether the scene has a collection of metaballs. Scenes of version 0.2 have them among the other objects."""
-    return next(_layers(scene), None) is not None
-
-
-def shown(scene: bpy.types.Scene) -> bool:
-    """Whether a view layer of the scene includes the metaballs, so that Blender evaluates them."""
-    return any(not layer.exclude for layer in _layers(scene))
-
-
-def show(scene: bpy.types.Scene, included: bool) -> None:
-    """Include the metaballs in every view layer of the scene, or exclude them."""
-    for layer in list(_layers(scene)):
-        layer.exclude = not included
-    for view_layer in scene.view_layers:
-        view_layer.update()  # until then Blender 4.5 crashes when a script goes through its objects
-
-
-def _layers(scene: bpy.types.Scene) -> Iterator[bpy.types.LayerCollection]:
-    waiting = [layer.layer_collection for layer in scene.view_layers]
-    while waiting:
-        layer = waiting.pop()
-        if COLLECTION_KEY in layer.collection:
-            yield layer
-        waiting.extend(layer.children)
 
 
 def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> list[bpy.types.Object]:

@@ -17,6 +17,12 @@ def new_group(name: str) -> tuple[bpy.types.NodeTree, bpy.types.Node, bpy.types.
     return group, group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
 
 
+def length_input(group: bpy.types.NodeTree, name: str, value_m: float) -> None:
+    """An input of the group that the modifier shows: a length."""
+    socket = group.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
+    socket.subtype, socket.min_value, socket.default_value = "DISTANCE", 0.0, value_m
+
+
 def add(group: bpy.types.NodeTree, kind: str, **properties: Any) -> bpy.types.Node:
     """A node of class `kind` with its properties set."""
     node = group.nodes.new(kind)
@@ -106,10 +112,14 @@ def images_of(material: bpy.types.Material) -> list[bpy.types.Image]:
     return [node.image for node in tree.nodes if node.type == "TEX_IMAGE" and node.image] if tree else []
 
 
-def attribute_material(name: str, attribute: str, scale: float) -> bpy.types.Material:
-    """Grey from the attribute times `scale`, so that the largest value is white."""
+# Of measured things in solid shading: legible on the grey of dark and of light themes, and over footage, most of which is of neither hue.
+AZURE, ORANGE = (0.0, 0.3, 1.0), (1.0, 0.22, 0.0)
+
+
+def attribute_material(name: str, attribute: str, scale: float, solid: tuple[float, float, float] = AZURE) -> bpy.types.Material:
+    """Grey from the attribute times `scale`, so that the largest value is white; `solid`: the one colour of solid shading."""
     material = bpy.data.materials.new(name)
-    material.diffuse_color = (0.2, 0.7, 1.0, 1.0)
+    material.diffuse_color = (*solid, 1.0)
     shader = _shader(material)
     tree = material.node_tree
     value = tree.nodes.new("ShaderNodeAttribute")
@@ -122,10 +132,10 @@ def attribute_material(name: str, attribute: str, scale: float) -> bpy.types.Mat
     return material
 
 
-def heat_material(name: str, attribute: str, largest: float) -> bpy.types.Material:
-    """From blue (0) over green to red (`largest`), by the attribute."""
+def heat_material(name: str, attribute: str, largest: float, solid: tuple[float, float, float] = ORANGE) -> bpy.types.Material:
+    """From blue (0) over green to red (`largest`), by the attribute; `solid`: the one colour of solid shading."""
     material = bpy.data.materials.new(name)
-    material.diffuse_color = (0.2, 0.7, 1.0, 1.0)
+    material.diffuse_color = (*solid, 1.0)
     shader = _shader(material)
     tree = material.node_tree
     value, scaled, ramp = (tree.nodes.new(kind) for kind in ("ShaderNodeAttribute", "ShaderNodeMath", "ShaderNodeValToRGB"))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from ...core.body.fields import EXPONENTIAL
 from ...core.body.skin.mesh import DETAIL
 
+POINTS_KEY = "tricap_points"  # custom property of the collection Measured: cloud and trajectories
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
 KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)

@@ -19,7 +19,7 @@ ARROW_S = 0.1  # an arrow has the length of the path in this time
 BEND_S2 = 0.02  # an arrow of an acceleration is it times this
 BARB = 0.25  # length of an arrow's barbs, as a fraction of it
 TRAIL_FRAMES = 10
-TRAIL_RADIUS_M = 0.0006
+TRAIL_RADIUS_M, TRAIL_RADIUS_PX = 0.0006, 0.6  # the larger of both, as of the cloud's points
 REDDEST_SPEED_M_S = 2.0  # painted red
 REDDEST_M_S2 = 20.0  # painted red
 
@@ -63,7 +63,14 @@ def sparser(arrays: Mapping[str, np.ndarray], most: int) -> tuple[Mapping[str, n
     return (arrays if k == 1 else {name: a[:, ::k] if a.ndim > 1 else a for name, a in arrays.items()}), k
 
 
-def add_removed(collection: bpy.types.Collection, raw: Mapping[str, np.ndarray], most: int) -> bpy.types.Object:
+def trail_radius_m(pixel_m: float) -> float:
+    """The radius of trails where the camera's pixels have this size."""
+    return max(TRAIL_RADIUS_M, TRAIL_RADIUS_PX * pixel_m)
+
+
+def add_removed(
+    collection: bpy.types.Collection, raw: Mapping[str, np.ndarray], most: int, radius_m: float = TRAIL_RADIUS_M
+) -> bpy.types.Object:
     """One object with what the filters removed, from the arrays of trajectories_raw.npz (frames, xyz_m, status), coloured by reason as in
     the report; of more than `most` positions every n-th trajectory. Attributes of the points: frame, track, reason (TrackStatus)."""
     gone = np.isfinite(raw["xyz_m"]).all(axis=-1) & (raw["status"] != TrackStatus.MEASURED)
@@ -93,22 +100,28 @@ def add_removed(collection: bpy.types.Collection, raw: Mapping[str, np.ndarray],
     mesh.materials.append(material)
     removed = bpy.data.objects.new(REMOVED_NAME, mesh)
     collection.objects.link(removed)
-    removed.modifiers.new("Trail", "NODES").node_group = trail_group(material)
+    removed.modifiers.new("Trail", "NODES").node_group = trail_group(material, radius_m=radius_m)
     return removed
 
 
-def add_bends(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+def add_bends(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], radius_m: float = TRAIL_RADIUS_M) -> bpy.types.Object:
     """The accelerations as arrows; see `add_arrows`."""
-    return _arrows(collection, arrays, BENDS_NAME, arrays["acceleration_m_s2"], BEND_S2, REDDEST_M_S2)
+    return _arrows(collection, arrays, BENDS_NAME, arrays["acceleration_m_s2"], BEND_S2, REDDEST_M_S2, radius_m)
 
 
-def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], radius_m: float = TRAIL_RADIUS_M) -> bpy.types.Object:
     """One object with an arrow for the velocity of every point in every frame; the viewport shows those of the current frame."""
-    return _arrows(collection, arrays, ARROWS_NAME, arrays["velocity_m_s"], ARROW_S, REDDEST_SPEED_M_S)
+    return _arrows(collection, arrays, ARROWS_NAME, arrays["velocity_m_s"], ARROW_S, REDDEST_SPEED_M_S, radius_m)
 
 
 def _arrows(
-    collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], name: str, vectors: np.ndarray, scale: float, reddest: float
+    collection: bpy.types.Collection,
+    arrays: Mapping[str, np.ndarray],
+    name: str,
+    vectors: np.ndarray,
+    scale: float,
+    reddest: float,
+    radius_m: float,
 ) -> bpy.types.Object:
     """Arrows of `vectors` (T, N, 3) times `scale` at the points, with their size as the attribute speed."""
     known = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(vectors).all(axis=-1)
@@ -131,15 +144,16 @@ def _arrows(
     mesh.materials.append(material)
     arrows_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(arrows_object)
-    arrows_object.modifiers.new("Current frame", "NODES").node_group = trail_group(material, 0)
+    arrows_object.modifiers.new("Current frame", "NODES").node_group = trail_group(material, 0, radius_m)
     return arrows_object
 
 
 def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES, radius_m: float = TRAIL_RADIUS_M) -> bpy.types.NodeTree:
-    """Geometry nodes: the edges of the last `Trail` frames before the current one, as thin tubes."""
+    """Geometry nodes: the edges of the last `Trail` frames before the current one, as thin tubes of the input `Radius`."""
     group, group_input, group_output = nodes.new_group("Tricap trail")
     trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
     trail.default_value, trail.min_value = frames, 0
+    nodes.length_input(group, "Radius", radius_m)
     now = nodes.add(group, "GeometryNodeInputSceneTime").outputs["Frame"]
     frame = nodes.attribute(group, "frame", "INT")
     begin = nodes.math(group, "SUBTRACT", now, group_input.outputs["Trail"])
@@ -150,7 +164,7 @@ def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES, radius
     curve = nodes.add(group, "GeometryNodeMeshToCurve")
     profile = nodes.add(group, "GeometryNodeCurvePrimitiveCircle")
     profile.inputs["Resolution"].default_value = 3
-    nodes.active(profile.inputs, "Radius").default_value = radius_m
+    group.links.new(group_input.outputs["Radius"], nodes.active(profile.inputs, "Radius"))
     tube = nodes.add(group, "GeometryNodeCurveToMesh")
     paint_node = nodes.add(group, "GeometryNodeSetMaterial")
     paint_node.inputs["Material"].default_value = material

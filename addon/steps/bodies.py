@@ -16,7 +16,8 @@ from ..operators import control_rig
 from ..panels import expanded, sentence
 from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
-from ..scene import footage_plane, layers, metaballs, standing
+from ..scene import excluded, footage_plane, layers, metaballs, standing
+from ..scene.options import POINTS_KEY
 from . import check, states, watch
 from .person import draw_person
 from .states import Fix, Status
@@ -177,7 +178,8 @@ def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) 
     asked = watch.current(context.scene).states["body"].click
     if asked is not None:
         button = primary(layout, "tricap.click_joints", True, icon="RESTRICT_SELECT_OFF", text=f"Click {asked[0]} in Frame {asked[1]}")
-        button.only, button.frame = asked
+        button.needed, button.frame = asked
+        sentence(layout, context, "After it you may click more joints. With three of shoulders and hips, the fit asks no more.", "INFO")
     _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")
@@ -217,8 +219,10 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
     if next(footage_plane.screens(context.scene), None) is not None:
         layout.prop(context.scene.tricap, "render_footage")
     if layers.parts(context.scene):
-        layout.row(align=True).prop(context.scene.tricap, "body_layer", expand=True)
-    if metaballs.exist(context.scene):
+        layout.prop(context.scene.tricap, "body_layer")
+    if edited is not None and excluded.exist(context.scene, POINTS_KEY):
+        layout.prop(context.scene.tricap, "show_measured")
+    if excluded.exist(context.scene, metaballs.COLLECTION_KEY):
         layout.prop(context.scene.tricap, "show_metaballs")
 
 

@@ -1,5 +1,6 @@
 """bpy.ops.tricap.cameras_from_file(filepath="…"), bpy.ops.tricap.cameras_from_scene()"""
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -7,7 +8,7 @@ import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
 from ...core.calibration.rig_files import read_any
-from ...core.calibration.view_names import names_for_views
+from ...core.calibration.view_names import from_left_to_right, names_for_views
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import Rig, renamed, write_rig
 from ...core.take.bar_file import bar_path, read_bar, write_bar
@@ -86,18 +87,23 @@ def show_cameras(operator: bpy.types.Operator, context: bpy.types.Context) -> No
 
 
 def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-    """Make these the project's cameras, and set the lenses of the clips. `bar`: frames and ends [m] of the wand, if they come from one.
+    """Make these the project's cameras, list the views in their order, and set the lenses of the clips.
+
+    `bar`: frames and ends [m] of the wand, if they come from one.
 
     Raises:
         InputError: a view has no camera of its name, or the project's folder cannot be written to.
     """
-    found = {view.name: rig[view.name] for view in scene.tricap.views}
+    views = scene.tricap.views
+    found = {view.name: rig[view.name] for view in views}
+    for place, name in enumerate(from_left_to_right(replace(rig, cameras=tuple(found.values())))):
+        views.move(views.find(name), place)
     folder = project.write(scene)
     write_rig(folder / "rig.toml", rig)
     bar_path(folder / "rig.toml").unlink(missing_ok=True)  # of the earlier cameras
     if bar is not None:
         write_bar(folder / "rig.toml", rig, *bar)
-    for view in scene.tricap.views:
+    for view in views:
         clips.set_lens(view.clip, found[view.name])
 
 

@@ -66,7 +66,7 @@ def in_panel(checked: Checked, mends: Mends) -> list[str]:
             button = ""
         advice = f"Press {button}, and check again." if button else finding.advice
         lines.append(str(replace(finding, advice=OPTION.sub(_named_setting, advice))))
-    return lines
+    return [*(lines or [GOOD]), *checked.notes]
 
 
 def _named_setting(option: re.Match[str]) -> str:
@@ -107,7 +107,7 @@ class Check(JobOperator, bpy.types.Operator):
         """Store the findings for the panel."""
         props = context.scene.tricap
         mends = mends_of(result)
-        props.check_said = "\n".join(in_panel(result, mends)) or GOOD
+        props.check_said = "\n".join(in_panel(result, mends))
         props.check_passed = not result.findings
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
         get_session().file.mends[props.check_key] = mends

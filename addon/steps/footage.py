@@ -13,6 +13,7 @@ from ...core.take.footage_files import copy_take, find_footage, find_moved, name
 from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
 from ..panels import sentence
+from ..scene.looking import show_all_frames
 from . import watch
 from .cameras import use_calibration_in
 from .simple_operator import SimpleOperator
@@ -279,6 +280,7 @@ def show_frames(scene: bpy.types.Scene) -> None:
     """Set the scene's frame range to that of the footage, and show the click frame."""
     scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
     scene.frame_set(min(scene.tricap.seed_frame, scene.frame_end))
+    show_all_frames(bpy.context)
 
 
 def lengths_differ(scene: bpy.types.Scene, folder: Path) -> bool:

@@ -4,7 +4,7 @@ import bpy
 
 from ..panels import TricapPanel, sentence
 from . import bodies, check, watch
-from .states import STAGE, STEPS, TITLES, State, Status
+from .states import STEPS, TITLES, State, Status, is_rate_assumed
 
 ICONS = {
     Status.EMPTY: "RADIOBUT_OFF",
@@ -12,6 +12,7 @@ ICONS = {
     Status.RUNNING: "SORTTIME",
     Status.DONE: "CHECKMARK",
     Status.STALE: "FILE_REFRESH",
+    Status.ASKS: "QUESTION",
     Status.FAILED: "ERROR",
 }
 LABELS = {
@@ -20,6 +21,7 @@ LABELS = {
     Status.RUNNING: "running",
     Status.DONE: "done",
     Status.STALE: "out of date",
+    Status.ASKS: "click needed",
     Status.FAILED: "failed",
 }
 
@@ -96,9 +98,13 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         number = STEPS.index(now.next)
         plays = ". Press Space to play the motion." if now.next == STEPS[-1] else ""
         sentence(box, context, f"Next: {number + 1} {TITLES[number]}{plays}", "FORWARD")
-    if now.next == "surface":  # seen before the run: with a body that needs no clicks, step 3 is done and folded
+    if now.next == "surface":  # seen before the run: steps 1 and 3 may be done and folded
+        if is_rate_assumed(context.scene):
+            row = box.row()
+            row.alert = True
+            row.prop(context.scene.tricap, "fps", text="FPS of the Images")
         box.prop(context.scene.tricap, "model", text="Body")
-    if now.next in STAGE:
+    if now.can_run:
         box.operator("tricap.run", icon="FF", text="Run Remaining Steps")
 
 

@@ -47,6 +47,7 @@ class Status(StrEnum):
     RUNNING = "running"
     DONE = "done"
     STALE = "stale"  # done, but with other inputs
+    ASKS = "asks"  # the fit asks for a click
     FAILED = "failed"
 
 
@@ -89,7 +90,12 @@ class StepStates:
         """The first step that is not done."""
         if self.states["footage"].status == Status.EMPTY:
             return "footage"
-        return next((step for step in STEPS if self.states[step].status in (Status.READY, Status.STALE, Status.FAILED)), None)
+        return next((step for step in STEPS if self.states[step].status in (Status.READY, Status.STALE, Status.ASKS, Status.FAILED)), None)
+
+    @property
+    def can_run(self) -> bool:
+        """Whether the remaining steps can be run: the next one computes, and waits for no click."""
+        return self.next in STAGE and self.states[self.next].status != Status.ASKS
 
 
 @dataclass(kw_only=True)
@@ -166,9 +172,13 @@ def _footage(scene: bpy.types.Scene, found: _Project) -> State:
         raise FixableError(str(error), Fix.COMMON_FRAMES) from error
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
     rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} fps"
-    assumed = not props.is_property_set("fps") and any(view.images for view in take.views)
-    doubt = f" Images have no frame rate; {rate} is assumed. Enter FPS." if assumed else ""
+    doubt = f" Images have no frame rate; {rate} is assumed. Enter FPS." if is_rate_assumed(scene) else ""
     return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.{doubt}")
+
+
+def is_rate_assumed(scene: bpy.types.Scene) -> bool:
+    """Whether the frame rate is one that nobody entered, and that the footage does not have."""
+    return not scene.tricap.is_property_set("fps") and any(view.images for view in scene.tricap.views)
 
 
 def _cameras(scene: bpy.types.Scene, found: _Project) -> State:

@@ -70,7 +70,8 @@ def _with_ends(scene: bpy.types.Scene, now: StepStates) -> StepStates:
         if name == scene.name_full and step in found:
             same, status = end.key == _input_key(step, now), found[step].status
             if same and status in (Status.READY, Status.STALE):
-                found[step] = State(status=Status.FAILED if end.failed else status, message=end.message, click=end.click)
+                ended = Status.ASKS if end.click else Status.FAILED if end.failed else status
+                found[step] = State(status=ended, message=end.message, click=end.click)
             elif not same or status == Status.DONE:
                 del ends[name, step]
     return StepStates(states=found, keys=now.keys)

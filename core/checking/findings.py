@@ -49,7 +49,8 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Finding:
-    """`sentence` and `advice` are for people. A `certain` finding is an error that spoils the measurement; others deserve a look.
+    """`sentence` and `advice` are for people. A `certain` finding is an error that spoils the measurement; others deserve a look. A
+    `harmless` one is a remark, which does not count as a finding of a check.
 
     `figures` holds the numbers, with their units in their names.
     """
@@ -58,15 +59,19 @@ class Finding:
     sentence: str
     advice: str
     certain: bool = True
+    harmless: bool = False
     figures: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
         """One line for a terminal."""
-        return f"{'Wrong' if self.certain else 'Doubtful'}: {self.sentence} {self.advice}"
+        kind = "Note" if self.harmless else "Wrong" if self.certain else "Doubtful"
+        return f"{kind}: {self.sentence} {self.advice}".rstrip()
 
     def to_table(self) -> dict[str, Any]:
         """As a plain table, for JSON."""
-        return asdict(self) | {"cause": self.cause.value, "figures": dict(self.figures)}
+        table = asdict(self) | {"cause": self.cause.value, "figures": dict(self.figures)}
+        del table["harmless"]  # those are notes
+        return table
 
 
 def wrong(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Finding:
@@ -77,6 +82,11 @@ def wrong(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Find
 def doubtful(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Finding:
     """Something that deserves a look."""
     return Finding(cause=cause, sentence=sentence, advice=advice, certain=False, figures=figures)
+
+
+def remark(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Finding:
+    """Something to know that harms nothing."""
+    return Finding(cause=cause, sentence=sentence, advice=advice, certain=False, harmless=True, figures=figures)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -12,7 +12,7 @@ from ..foundation.progress import Monitor
 from ..images.retime import Recent
 from ..images.sequence import Movie
 from ..take.footage import Footage
-from .findings import Cause, Finding, doubtful, wrong
+from .findings import Cause, Finding, doubtful, remark, wrong
 
 LONGEST = 240  # frames; of a longer take its middle is used
 WIDTH_PX = 96  # of the reduced images
@@ -25,6 +25,7 @@ BEGINNING = 50  # frames of a movie
 UNEVEN = 0.6  # frames; time stamps are rounded
 REPEATED = 0.2  # of a view's usual motion energy, which includes the noise
 FEWEST_FRAMES = 4  # for a usual motion energy
+SELDOM = 0.02  # share of repeated frames, and one at least, that harms nothing: there the motion pauses for a frame
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -184,15 +185,21 @@ def _repeated(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
         with np.errstate(invalid="ignore"):
             same = (figures.energy[k] < REPEATED * usual) & (figures.spread[k] >= BLANK_SPREAD)
         if usual > 0 and same.any():
-            first = figures.frames[int(np.argmax(same))]
-            findings.append(
-                wrong(
-                    Cause.REPEATED_FRAMES,
-                    f"View {name} repeats the frame before in {int(same.sum())} of {len(same)} frames, "
-                    f"first in frame {first}: the camera dropped frames, or a conversion filled them in.",
-                    "Convert the recording again at its own frame rate, or leave those frames out.",
-                    frames=int(same.sum()),
-                    first=first,
-                )
-            )
+            findings.append(_repeats(name, figures.frames[int(np.argmax(same))], int(same.sum()), len(same)))
     return findings
+
+
+def _repeats(name: str, first: int, count: int, frames: int) -> Finding:
+    """A view that repeats some frames: a remark if these are few."""
+    if count <= max(1, SELDOM * frames):
+        where = f"in frame {first}" if count == 1 else f"in {count} of {frames} frames, first in frame {first}"
+        sentence = f"View {name} repeats the frame before {where}; the motion pauses there."
+        return remark(Cause.REPEATED_FRAMES, sentence, frames=count, first=first)
+    return wrong(
+        Cause.REPEATED_FRAMES,
+        f"View {name} repeats the frame before in {count} of {frames} frames, "
+        f"first in frame {first}: the camera dropped frames, or a conversion filled them in.",
+        "Convert the recording again at its own frame rate, or leave those frames out.",
+        frames=count,
+        first=first,
+    )

@@ -234,7 +234,9 @@ def check_take(folder: Path, monitor: Monitor) -> Checked:
         findings += [*joint_findings(footage.take), *opening_findings(footage, fitting, monitor)]
     except InputError as error:
         findings, figures = [wrong(Cause.INPUT, str(error))], {}
-    return Checked(subject=str(folder), kind="take", findings=tuple(findings), figures=figures)
+    notes = tuple(str(finding) for finding in findings if finding.harmless)
+    harmful = tuple(finding for finding in findings if not finding.harmless)
+    return Checked(subject=str(folder), kind="take", findings=harmful, figures=figures, notes=notes)
 
 
 def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], dict[str, object]]:
@@ -310,7 +312,8 @@ def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
     Raises:
         InputError: an image cannot be read.
     """
-    return sorted(check_footage(footage, monitor)[0], key=lambda finding: not finding.certain)
+    harmful = [finding for finding in check_footage(footage, monitor)[0] if not finding.harmless]
+    return sorted(harmful, key=lambda finding: not finding.certain)
 
 
 def check_clouds(footage: Footage, frames: list[int], points: list[int], residual_px: list[float], monitor: Monitor) -> list[str]:

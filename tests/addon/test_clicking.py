@@ -129,6 +129,18 @@ def test_a_session_ends_when_every_joint_is_clicked_twice_or_skipped(session: An
     assert session.back() and session.missing() == {first: 1}
 
 
+def test_a_skipped_joint_is_not_asked_for_in_the_second_round(session: Any) -> None:
+    assert session.names == ["shoulder.R", "elbow.R", "wrist.R"]
+    session.accept()
+    session.skip()
+    session.accept()
+    assert session.name == "shoulder.R", "left without a click, so that it is asked for again"
+    session.accept()
+    assert session.name == "wrist.R"
+    session.go_to("elbow.R")
+    assert session.name == "elbow.R", "on request it can be clicked all the same"
+
+
 def test_a_click_near_the_proposal_takes_it(session: Any, truth: Truth) -> None:
     camera = dict(zip(session.views, session.finder.cameras))
     X = sleeve_point(session, truth, 0)
@@ -367,11 +379,12 @@ def _holds(t: np.ndarray, p: np.ndarray) -> bool:
 
 
 def test_the_order_of_the_joints(blender: ModuleType) -> None:
-    joints_of = module("clicking.click_session").joints_of
+    joints_of, needed_first = (getattr(module("clicking.click_session"), name) for name in ("joints_of", "needed_first"))
     from tricap.core.body.model_file import read_model
 
     every = read_model("full").skeleton.joint_names
     asked = joints_of(every)
+    assert needed_first(["head", "shoulder.R", "hip.R", "knee.R"], "knee.R") == ["knee.R", "shoulder.R", "hip.R", "head"]
     assert asked[0] == "head" and "chest" not in asked and "crown" not in asked and "chest" in joints_of(every, hidden=True)
     assert joints_of(read_model("leg.L").skeleton.joint_names) == ["hip.L", "knee.L", "ankle.L"]
 

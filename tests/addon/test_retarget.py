@@ -178,8 +178,13 @@ def test_an_action_is_a_source_and_comes_back(empty: ModuleType) -> None:
 def it_begins_where_it_stands(bpy: ModuleType, target: Any, props: Any) -> None:
     hips = next(row.bones.partition(",")[0] for row in props.rows if row.role == "hips")
     bpy.context.scene.frame_set(int(target.animation_data.action.frame_range[0]))
-    now, rest = target.pose.bones[hips].matrix.translation, target.data.bones[hips].head_local
-    assert props.place == "SIDE" and (now - rest).xy.length < 1e-4
+    rest = target.data.bones[hips].head_local
+    assert props.place == "SIDE" and (target.pose.bones[hips].matrix.translation - rest).xy.length == pytest.approx(1.0, abs=1e-4), (
+        "beside the source, in which it stands"
+    )
+    target.location.x = 2.0
+    assert bpy.ops.tricap.retarget() == {"FINISHED"}
+    assert (target.pose.bones[hips].matrix.translation - rest).xy.length < 1e-4
 
 
 def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleType) -> None:
@@ -190,8 +195,12 @@ def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleTy
     former = target.animation_data.action.name
     kept = [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points]
     props = bpy.context.scene.tricap_retarget
-    props.source, props.target = source, target
-    assert bpy.ops.tricap.retarget_find_map() == {"FINISHED"} and len(props.rows) == 20
+    props.source, other = source, armature(person(), "Other")
+    with pytest.raises(RuntimeError, match="Choose an armature as the target"):
+        bpy.ops.tricap.retarget()
+    bpy.data.objects.remove(other)
+    assert props.target is None and bpy.ops.tricap.retarget_find_map() == {"FINISHED"} and len(props.rows) == 20
+    assert props.target == target, "the only other armature"
     assert bpy.ops.tricap.retarget() == {"FINISHED"}
     assert target.animation_data.action.name != former and "limb directions" in props.last
     assert [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points] == kept

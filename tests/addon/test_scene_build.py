@@ -100,9 +100,12 @@ def test_footage_that_starts_later_is_shifted(empty: ModuleType, small_run: Smal
 
 
 def test_cloud_and_trails_show_the_current_frame(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene import excluded
     from tricap.addon.scene.build import build_scene
+    from tricap.addon.scene.options import POINTS_KEY
 
     build_scene(small_run.out)
+    excluded.show(empty.context.scene, POINTS_KEY, True)
     for i, frame in enumerate(FRAMES):
         empty.context.scene.frame_set(frame)
         graph = empty.context.evaluated_depsgraph_get()

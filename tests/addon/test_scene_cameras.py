@@ -130,8 +130,8 @@ def test_footage_that_blender_cannot_show_is_told(empty: ModuleType, tmp_path: P
     assert "only 3 of the 8" in gap
 
 
-@pytest.mark.parametrize("fisheye", [False, True])
-def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, tmp_path: Path, fisheye: bool) -> None:
+@pytest.mark.parametrize(("fisheye", "movie"), [(False, False), (True, False), (False, True)])
+def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, tmp_path: Path, fisheye: bool, movie: bool) -> None:
     """The screen before the camera, rendered, against the image undistorted by the camera's own model."""
     import cv2
 
@@ -143,6 +143,13 @@ def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, 
     y, x = np.indices(SIZE[::-1])
     for i, file in enumerate(files):
         cv2.imwrite(str(file), (90 + 30 * i + 30 * np.sin(x / 9) * np.cos(y / 7)).astype(np.uint8))
+    images = [cv2.imread(str(file)) for file in files]
+    if movie:
+        files = [tmp_path / "R.avi"]
+        writer = cv2.VideoWriter(str(files[0]), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE)
+        for image in images:
+            writer.write(image)
+        writer.release()
     seen = cameras.add_camera(scene.collection, camera)
     clip = clips.load_clip("R", files[0], camera)
     clip.frame_start, scene.camera = 10, seen
@@ -160,7 +167,7 @@ def test_renders_show_the_undistorted_footage_of_their_frame(empty: ModuleType, 
     empty.ops.render.render(write_still=True)
     got, wanted = (
         cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_GRAYSCALE),
-        undistorted(cv2.imread(str(files[1]), cv2.IMREAD_GRAYSCALE), camera),
+        undistorted(images[1][..., 0], camera),
     )
     inside = np.s_[6:-6, 6:-6]
     difference = got[inside].astype(float) - wanted[inside]

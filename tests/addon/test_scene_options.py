@@ -182,15 +182,53 @@ def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: 
 
 
 def test_one_skin_is_shown_and_metaballs_are_excluded_behind_it(empty: ModuleType, small_run: SmallRun) -> None:
-    from tricap.addon.scene import metaballs
+    from tricap.addon.scene import excluded, metaballs
     from tricap.addon.scene.build import build_scene
 
     build_scene(small_run.out)
     shown = {o.name for o in empty.data.objects if o.type in ("MESH", "META") and o.name.startswith(("Skin", "Flesh")) and o.visible_get()}
     assert shown == {"Skin"} and not empty.data.objects["Skin"].hide_render and empty.data.objects["Flesh"].hide_render
-    metaballs.show(empty.context.scene, True)
+    excluded.show(empty.context.scene, metaballs.COLLECTION_KEY, True)
     flesh = empty.data.objects["Flesh"].evaluated_get(empty.context.evaluated_depsgraph_get())
     assert len(flesh.to_mesh().vertices) > 100
+
+
+def test_cloud_and_trajectories_step_back_behind_the_skin(blender: ModuleType, small_run: SmallRun) -> None:
+    """They would lie over it. The switch shows them; who asks for arrows of velocities sees them at once."""
+    from tricap.addon.scene.build import SceneOptions, build_scene
+
+    scene, measured = blender.context.scene, ("Cloud", "Trajectories")
+    build_scene(small_run.out)
+    assert not scene.tricap.show_measured and not any(name in blender.context.view_layer.objects for name in measured)
+    scene.tricap.show_measured = True
+    assert all(blender.data.objects[name].visible_get() and name in blender.context.view_layer.objects for name in measured)
+    scene.tricap.show_measured = False
+    assert not any(name in blender.context.view_layer.objects for name in measured)
+    build_scene(small_run.out, options=SceneOptions(arrows=True))
+    assert scene.tricap.show_measured and blender.data.objects["Velocities"].visible_get()
+
+
+def test_points_and_trails_are_wide_enough_for_the_camera(blender: ModuleType, small_run: SmallRun) -> None:
+    """Where a person is far away, points of 1.5 mm are a fraction of a pixel, and nobody sees them."""
+    from tricap.addon.scene import cloud, trajectories
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out)
+    camera, elbow = small_run.rig["C"], np.array([small_run.joints_m["elbow.R"][len(FRAMES) // 2]])
+    pixel_m = cloud.pixel_size_m(camera, elbow)
+    assert pixel_m == pytest.approx(camera.to_camera(elbow)[0, 2] / 390, rel=0.03) and pixel_m > 4e-3
+    blender.context.scene.frame_set(FRAMES[-1])
+    for name, px in (("Cloud", cloud.POINT_RADIUS_PX), ("Trajectories", trajectories.TRAIL_RADIUS_PX)):
+        group = blender.data.objects[name].modifiers[0].node_group
+        assert group.interface.items_tree["Radius"].default_value == pytest.approx(px * pixel_m, rel=0.03)
+    blender.context.scene.tricap.show_measured = True
+    trails, widths = blender.data.objects["Trajectories"], []
+    for radius_m in (0.0, 0.01):
+        trails.modifiers.clear()
+        trails.modifiers.new("Trail", "NODES").node_group = trajectories.trail_group(trails.data.materials[0], radius_m=radius_m)
+        widths.append(world_vertices(blender, trails))
+    assert np.linalg.norm(widths[1] - widths[0], axis=1) == pytest.approx(0.01, rel=0.2)
+    assert cloud.pixel_size_m(camera, np.zeros((0, 3))) == 0.0 and trajectories.trail_radius_m(0.0) == trajectories.TRAIL_RADIUS_M
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:

@@ -190,12 +190,14 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
         with pytest.raises(RuntimeError, match="Click the right wrist in two views of frame 2"):
             operator()
         state = watch.current(scene).states["body"]
-        assert words().split()[3:6] == ["done", "done", "failed"] and state.click == ("wrist.R", 2)
+        assert words().split()[3:6] == ["done", "done", "asks"] and state.click == ("wrist.R", 2)
         assert {"Camera L", "Cloud", "Trajectories"} <= set(scene.objects.keys())
-    assert "tricap.click_joints" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
+    offered = type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
+    assert "tricap.click_joints" in offered and "tricap.run" not in offered
     assert scene.tricap.seed_frame == 0
     scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers.insert_frame(3, co=(0.5, 0.5))
-    assert words().split()[3:5] == ["done", "done"] and watch.current(scene).states["body"].click is None
+    assert words().split()[3:6] == ["done", "done", "ready"] and watch.current(scene).states["body"].click is None
+    assert "tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
 
 
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
@@ -528,6 +530,45 @@ def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: 
     assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 fps.")
 
 
+def test_the_remaining_steps_are_run_from_the_views(blender: ModuleType, sample: Path, layout: Any, tmp_path: Path) -> None:
+    """Beside Back to Steps above the first view, where a run can begin; the operator goes back first."""
+    views, watch = (importlib.import_module(f"{NAME}.{name}") for name in ("clicking.open_views", "steps.watch"))
+    scene, window = opened(blender, sample, tmp_path), blender.context.window_manager.windows[0]
+    area = max(window.screen.areas, key=lambda area: area.width * area.height)
+    area.type = "CLIP_EDITOR"
+    area.spaces.active.clip = scene.tricap.views[0].clip
+    offered = []
+    for name in ("Mine", views.NAME):
+        window.workspace.name = name
+        assert watch.refresh(scene).can_run
+        with blender.context.temp_override(window=window, area=area):
+            header = SimpleNamespace(layout=type(layout)())
+            views.draw_back(header, blender.context)
+            offered.append(header.layout.operators)
+    assert offered == [[], ["tricap.back_to_steps", "tricap.back_to_steps"]]
+    (tmp_path / "take" / "rig.toml").unlink()
+    with pytest.raises(RuntimeError, match=r"rig\.toml"):  # it runs
+        blender.ops.tricap.back_to_steps(run=True)
+    assert not watch.refresh(scene).can_run
+
+
+def test_an_assumed_rate_is_shown_beside_the_button_that_runs(
+    blender: ModuleType, sample: Path, layout: Any, why: Any, tmp_path: Path
+) -> None:
+    """Step 1 is done and folded then, and nobody would see it there."""
+    watch, panel = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("watch", "panel"))
+    shutil.copytree(sample, tmp_path / "film")
+    (tmp_path / "film" / "take.toml").unlink()
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    count = []
+    for _ in range(2):
+        assert watch.refresh(blender.context.scene).next == "surface"
+        count.append(type(layout)().draw(panel.TRICAP_PT_main, blender.context).properties.count("fps"))
+        blender.context.scene.tricap.fps = blender.context.scene.tricap.fps  # entered, although it is the same
+    assert count[0] == count[1] + 1 and "assumed" not in why("footage")
+
+
 def recorded_at_30(sample: Path, folder: Path) -> Path:
     """A take at 30 images a second, of which the right camera started one image earlier; its views are listed from right to left."""
     shutil.copytree(sample, folder)
@@ -666,6 +707,8 @@ def test_the_panel_names_buttons_and_settings_instead_of_files_and_options(blend
         "Doubtful: View C is late. Use Correct true (step 4 Surface), which helps.",
     ]
     assert "offset_frames" in check.in_panel(checked, check.Mends())[0], "without a button the file is named"
+    remarked = findings.Checked(subject="kick", kind="take", findings=(), figures={}, notes=("Note: a frame is repeated.",))
+    assert check.in_panel(remarked, check.Mends()) == [check.GOOD, "Note: a frame is repeated."]
 
 
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])

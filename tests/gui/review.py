@@ -38,7 +38,7 @@ def steps() -> drive.Steps:
     yield from drive.settle(10)
     yield from drive.shot("1_side_by_side")
     yield from pulled()
-    yield from drive.press(drive.area_of("CLIP_EDITOR"), "tricap.back_to_steps", "HEADER")
+    yield from drive.press(drive.area_of("CLIP_EDITOR"), "back_to_steps()", "HEADER")
     yield from drive.wait_for(lambda: drive.window().workspace.name == "Layout", 10, "the button leads back to the steps")
 
 

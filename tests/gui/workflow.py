@@ -99,7 +99,7 @@ def seeds(wanted: Joints) -> drive.Steps:
     yield from drive.settle(10)
     check_clicks(wanted)
     yield from drive.shot("07_clicked")
-    yield from drive.press(clip_areas()[0], "tricap.back_to_steps", "HEADER")
+    yield from drive.press(clip_areas()[0], "back_to_steps()", "HEADER")
     yield from drive.wait_for(lambda: drive.window().workspace.name == LAYOUT, 10, "the button leads back to the steps")
 
 

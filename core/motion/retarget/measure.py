@@ -27,9 +27,13 @@ class Figures:
     frames: int
 
     def __str__(self) -> str:
+        feet = (
+            f" feet slide up to {self.slide_mm:.1f} mm in {self.contacts} contacts, sink {self.penetration_mm:.1f} mm,"
+            if self.contacts
+            else ""
+        )
         return (
-            f"limb directions {self.direction_rms_deg:.2f}° RMS (worst {self.direction_worst_deg:.1f}°), feet slide up to"
-            f" {self.slide_mm:.1f} mm in {self.contacts} contacts, sink {self.penetration_mm:.1f} mm,"
+            f"limb directions {self.direction_rms_deg:.2f}° RMS (worst {self.direction_worst_deg:.1f}°),{feet}"
             f" largest turn from frame to frame {self.largest_step_deg:.0f}°"
         )
 

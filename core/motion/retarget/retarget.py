@@ -26,6 +26,7 @@ from .transfer import alignments, body_axes, share_twist, turn, with_offsets
 SHORTEST_LIMB_M = 1e-4
 LYING = 0.3  # height of the head over the hips by their distance: a lower median means that the source lies
 STEPS = 4
+BESIDE_M = 1.0  # a target that would begin in the source begins so far beside it
 PARTS_NAMED = 4  # in a sentence
 
 
@@ -69,18 +70,34 @@ class Retargeted:
         return replace(self.motion, head_m=self.motion.head_m + self.removed_travel_m[:, None])
 
 
-def begun_at_rest(result: Retargeted) -> Retargeted:
-    """The motion moved over the floor so that the body begins where it stands at rest. A motion without a carrier stays as it is."""
+def begun_at_rest(result: Retargeted, source: MappedMotion | None = None) -> Retargeted:
+    """The motion moved over the floor so that the body begins where it stands at rest; where that is in the `source`, beside it. A motion
+    without a carrier stays as it is."""
     if result.carrier < 0:
         return result
     known = np.flatnonzero(np.isfinite(result.shift_m).all(axis=1))
     aside_m = result.shift_m[known[0]] * (1.0, 1.0, 0.0) if len(known) else np.zeros(3)
+    hips = source.map.first("hips") if source is not None else None
+    if source is not None and hips is not None and len(known):
+        begins_m = result.motion.head_m[known[0], result.carrier] - aside_m
+        aside_m = aside_m - _beside_m(begins_m, source.motion.head_m[known, source.motion.rig.index[hips]])
     return replace(
         result,
         motion=replace(result.motion, head_m=result.motion.head_m - aside_m),
         shift_m=result.shift_m - aside_m,
         loose_m={bone: shift - aside_m for bone, shift in result.loose_m.items()},
     )
+
+
+def _beside_m(begins_m: np.ndarray, path_m: np.ndarray) -> np.ndarray:
+    """By how much a body that begins at a place is moved (3,), so that it does not begin in another one, whose path (T, 3) is given: across
+    that path, or along x where there is none."""
+    if np.linalg.norm((begins_m - path_m[0])[:2]) >= BESIDE_M / 2:
+        return np.zeros(3)
+    x, y, _ = path_m[-1] - path_m[0]
+    length = float(np.hypot(x, y))
+    across = np.array([y, -x, 0.0]) / length if length > BESIDE_M / 2 else np.array([1.0, 0.0, 0.0])
+    return BESIDE_M * across
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tricap.core.checking.findings import Checked
+from tricap.core.checking.survey import Survey, picture_findings
 from tricap.core.checking.take_check import check_clouds, check_take, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.cli import main
@@ -366,3 +367,26 @@ def test_steps_that_are_none() -> None:
     assert not sudden_step(list(range(40)), 0.01 * steady * np.where(np.arange(40) > 20, 3.0, 1.0)), "it harms nobody"
     assert sudden_step(list(range(10, 50)), steady * np.where(np.arange(40) >= 20, 3.0, 1.0))[0].startswith("From frame 30 on")
     assert sudden_step(list(range(8)), np.array([0.1] * 4 + [0.3] * 4)) and not sudden_step(list(range(7)), np.array([0.1] * 3 + [0.3] * 4))
+
+
+@pytest.mark.parametrize(("repeats", "harmless"), [((7,), True), ((3, 7), False), ((), None)])
+def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int, ...], harmless: bool | None) -> None:
+    """A camera that drops a frame now and then harms nothing; a conversion to another frame rate does."""
+    energy, like = 1.0 + rhythm(12)[None], np.full((1, 12), 50.0)
+    energy[0, list(repeats)] = 0.0
+    found = picture_findings(Survey(frames=range(12), energy=energy, spread=like, bright=3 * like, white=0 * like), ("R",))
+    assert [finding.harmless for finding in found] == ([] if harmless is None else [harmless])
+    for finding in found:
+        assert str(finding).startswith("Note: " if harmless else "Wrong: ") and finding.figures == {
+            "frames": len(repeats),
+            "first": repeats[0],
+        }
+
+
+def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    files = pictures(take, "R")
+    shutil.copy(files[2], files[3])
+    checked = check_take(take, Monitor())
+    assert not checked.findings and len(checked.notes) == 1 and "View R repeats the frame before in frame 3" in checked.lines()[1]
+    assert checked.to_table()["good"] and checked.to_table()["notes"] == list(checked.notes)

@@ -441,3 +441,12 @@ def test_another_frame_rate() -> None:
     assert len(twice.frames) == 121 and twice.frames[0] == 5.0
     np.testing.assert_allclose(twice.R[::2], motion.R, atol=1e-9)
     np.testing.assert_allclose(twice.head_m[::2], motion.head_m, atol=1e-9)
+
+
+def test_a_target_that_would_begin_in_its_source_is_moved_across_the_path() -> None:
+    from tricap.core.motion.retarget.retarget import BESIDE_M, _beside_m
+
+    walks = np.array([[0.0, 0.0, 0.9], [0.0, 1.0, 0.9], [0.0, 2.0, 0.9]])
+    np.testing.assert_allclose(_beside_m(np.array([0.1, 0.0, 0.8]), walks), [BESIDE_M, 0, 0])
+    np.testing.assert_allclose(_beside_m(np.array([0.0, 0.1, 0.8]), walks[:1].repeat(3, axis=0)), [BESIDE_M, 0, 0])
+    np.testing.assert_array_equal(_beside_m(np.array([0.6, 0.0, 0.8]), walks), 0)
