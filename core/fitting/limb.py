@@ -78,6 +78,17 @@ def whole_limbs(parameters: ShapeParameters) -> list[Limb]:
 @lru_cache(maxsize=32)
 def halton(dimensions: int, count: int) -> np.ndarray:
     """Points (count, dimensions) evenly in the unit cube, the same in every run (Halton 1960)."""
-    from scipy.stats import qmc  # takes longer to import than the rest of a command
+    bases = list[int]()  # the first primes
+    while len(bases) < dimensions:
+        last = bases[-1] if bases else 1
+        bases.append(next(n for n in range(last + 1, 2 * last + 1) if all(n % base for base in bases)))
+    return np.stack([_radical_inverse(count, base) for base in bases], axis=1)
 
-    return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
+
+def _radical_inverse(count: int, base: int) -> np.ndarray:
+    """The digits of 0, 1, 2, … in a base, mirrored at the point (count,)."""
+    rest, found, unit = np.arange(count), np.zeros(count), 1.0 / base
+    while rest.any():
+        found += rest % base * unit
+        rest, unit = rest // base, unit / base
+    return found

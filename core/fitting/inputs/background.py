@@ -47,6 +47,7 @@ STILL = 0.25  # of a limb's line looks like the background, if the limb stands s
 NEAR_M = 0.025  # nothing so near to a measured point shows the background
 BAND = 0.5  # width of a clicked limb over the mean length of the limbs
 HAND_FRACTION, HAND_SIGMA = 0.5, 3.0  # of a hand's axis; its sigma over that of the outline
+CACHED_BYTES = 64_000_000  # of the frames whose distances are unpacked
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,11 +81,12 @@ class BackgroundRegions:
         self._given = given.background if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
         self._cells: dict[int, list[PersonCells]] = {}
+        self._unpacked: dict[int, list[DistanceMap]] = {}
 
     def stretch(self, frames: Sequence[int]) -> "BackgroundRegions":
         """Those of some of the frames."""
         part = copy(self)
-        part._frames, part._cells = [self._frames[t] for t in frames], {}
+        part._frames, part._cells, part._unpacked = [self._frames[t] for t in frames], {}, {}
         return part
 
     def observe(self, t: int) -> list[BackgroundExclusion]:
@@ -100,21 +102,30 @@ class BackgroundRegions:
         return bool(self._given)
 
     def cells(self, t: int) -> list[PersonCells]:
-        """The person's cells in frame index `t`, of the views whose background is known; the last frame's are cached."""
+        """The person's cells in frame index `t`, of the views whose background is known; those of the last frames are cached."""
+        maps = self._maps(t)
         if t not in self._cells:
-            self._cells = {t: [_person_cells(view) for view in self._maps(t) if view.values_px.any() and not view.values_px.all()]}
+            self._cells[t] = [_person_cells(view) for view in maps if view.table.any() and not view.table.all()]
         return self._cells[t]
 
     def _maps(self, t: int) -> list[DistanceMap]:
-        return [
-            DistanceMap(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
-            for v in self._given
-            if (d := v.of_frame(self._frames[t])) is not None
-        ]
+        """Those of one frame; of the last frames they are cached, and so are the cells."""
+        if t not in self._unpacked:
+            found = [
+                DistanceMap(camera=self._rig[v.view], table=d, step_px=v.step_px, first_px=(v.step_px - 1) / 2, unit_px=v.unit_px)
+                for v in self._given
+                if (d := v.of_frame(self._frames[t])) is not None
+            ]
+            if len(self._unpacked) * sum(view.table.nbytes for view in found) > CACHED_BYTES:
+                oldest = next(iter(self._unpacked))
+                del self._unpacked[oldest]
+                self._cells.pop(oldest, None)
+            self._unpacked[t] = found
+        return self._unpacked[t]
 
 
 def _person_cells(view: DistanceMap) -> PersonCells:
-    j, i = np.nonzero(view.values_px == 0)
+    j, i = np.nonzero(view.table == 0)
     every = 1 + (len(i) - 1) // MOST_CELLS
     xy = view.first_px + view.step_px * np.stack([i, j], axis=1)[::every]
     rays = view.camera.rays(xy)

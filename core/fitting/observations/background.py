@@ -8,7 +8,7 @@ with |u| far outside (pseudo-Huber, Charbonnier et al. 1994), so that a wrong ou
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,9 +23,10 @@ class DistanceMap:
     """d of (1) in one view, every `step_px` pixels: node (j, i) is at the pixel (first + i · step, first + j · step)."""
 
     camera: Camera
-    values_px: np.ndarray  # (h, w)
+    table: np.ndarray  # (h, w) in units of `unit_px`
     step_px: float
     first_px: float
+    unit_px: float = 1.0
 
     def sampled(self, xy_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """d (N,) and its gradient (N, 2) at pixels (N, 2), bilinear; 0 outside the image, where nothing is known."""
@@ -41,13 +42,13 @@ class DistanceMap:
 
     def _around(self, xy_px: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray], np.ndarray]:
         """d at the four nodes about each of N pixels, the pixel's fractions between them, and whether it is inside the image."""
-        h, w = self.values_px.shape
+        h, w = self.table.shape
         x, y = ((xy_px[:, i] - self.first_px) / self.step_px for i in range(2))
         inside = (x >= 0) & (y >= 0) & (x < w - 1) & (y < h - 1)
         x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
         i, j = x.astype(np.intp), y.astype(np.intp)
-        at, flat = j * w + i, self.values_px.reshape(-1)
-        corners = tuple(flat.take(at + d).astype(np.float64) for d in (0, 1, w, w + 1))
+        at, flat = j * w + i, self.table.reshape(-1)
+        corners = tuple(flat.take(at + d) * self.unit_px for d in (0, 1, w, w + 1))
         return corners, (x - i, y - j), inside
 
 
@@ -62,6 +63,7 @@ class BackgroundExclusion(FromBlocks):
     sigma_px: np.ndarray  # (P,)
     kind: str = ""
     variance_inflation: np.ndarray | float = 1.0
+    _last: list[tuple[BodyState, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]] = field(default_factory=list, init=False, repr=False)
 
     @property
     def size(self) -> int:
@@ -70,14 +72,12 @@ class BackgroundExclusion(FromBlocks):
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(views · P,)  (1)"""
-        xyz = self._mix(state.joints_m, np.arange(len(self.head)))
-        return np.concatenate([_pseudo_huber(view.sampled(view.camera.project(xyz))[0] / self.sigma_px)[0] for view in self.views])
+        return np.concatenate([_pseudo_huber(d / self.sigma_px)[0] for d, _ in self._sampled(state)[1]])
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
         """One block for each view in which a point is outside: most are inside, where the derivative is zero."""
-        xyz = self._mix(state.joints_m, np.arange(len(self.head)))
-        for k, view in enumerate(self.views):
-            d, gradient = view.sampled(view.camera.project(xyz))
+        xyz, sampled = self._sampled(state)
+        for k, (view, (d, gradient)) in enumerate(zip(self.views, sampled)):
             out = np.flatnonzero(gradient.any(axis=1))
             if not len(out):
                 continue
@@ -86,6 +86,13 @@ class BackgroundExclusion(FromBlocks):
             across = (_pseudo_huber(d[out] / self.sigma_px[out])[1] / self.sigma_px[out])[:, None] * gradient[out]
             in_image = view.camera.project_with_jacobian(xyz[out])[1]
             yield k * len(self.head) + out, np.arange(dxyz.shape[2]), np.einsum("pa,pai,pik->pk", across, in_image, dxyz, optimize=True)
+
+    def _sampled(self, state: BodyState) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+        """The points (P, 3), and d (P,) with its gradient (P, 2) in each view; those of the last state are cached."""
+        if not self._last or self._last[0][0] is not state:
+            xyz = self._mix(state.joints_m, np.arange(len(self.head)))
+            self._last[:] = [(state, xyz, [view.sampled(view.camera.project(xyz)) for view in self.views])]
+        return self._last[0][1:]
 
     def _mix(self, of_joints: np.ndarray, which: np.ndarray) -> np.ndarray:
         f = self.fraction[which].reshape(-1, *[1] * (of_joints.ndim - 1))

@@ -8,7 +8,7 @@ A ray belongs to one bone's part, whose field is F. The sigma is that of the con
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,6 +32,7 @@ class SilhouetteRays(FromBlocks):
     tangent: SurfacePoints  # the points of contact at the reference state, with their weights
     along_m: np.ndarray  # (N,) their places on the rays, from which t* is iterated at other states
     kind: str = "contours"
+    _last: list[tuple[BodyState, SurfacePoints]] = field(default_factory=list, init=False, repr=False)  # at the state evaluated last
 
     @staticmethod
     def about(
@@ -73,7 +74,9 @@ class SilhouetteRays(FromBlocks):
         return len(self.bone)
 
     def _points(self, state: BodyState) -> SurfacePoints:
-        return self.tangent.moved(self.contacts(state))
+        if not self._last or self._last[0][0] is not state:
+            self._last[:] = [(state, self.tangent.moved(self.contacts(state)))]
+        return self._last[0][1]
 
 
 def _contacts(

@@ -182,13 +182,14 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
     return total + (problem.smoothness.cost(motion) if problem.smoothness is not None else 0.0)
 
 
-def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
-    """The variance factors of the kinds (`robust.variance_factor`)."""
+def variance_factors(problem: Problem, at: Estimate) -> Scales:
+    """The variance factors of the kinds at a motion and shape (`variance_factor`)."""
+    scales = at.scales
     return Scales(
         **{
             kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
             * max(1.0, scales.of(kind) / LARGEST_SCALE.get(kind, np.inf)) ** 2
-            for kind, r in lin.residuals.items()
+            for kind, r in _residuals(problem, at).items()
             if r
         }
     )
@@ -196,7 +197,12 @@ def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scale
 
 def first_scales(problem: Problem, start: Estimate) -> Scales:
     """The scales of the residuals before the first step."""
-    states, residuals = problem.parameters.states(start.motion, start.vector), dict[str, list[np.ndarray]]()
+    return start.scales.renewed(_residuals(problem, start))
+
+
+def _residuals(problem: Problem, at: Estimate) -> dict[str, list[np.ndarray]]:
+    """The residuals of robust observations, by kind."""
+    states, residuals = problem.parameters.states(at.motion, at.vector), dict[str, list[np.ndarray]]()
     for t, state in enumerate(states):
         problem.monitor.check()
         for o in problem.observe(t, state):
@@ -206,7 +212,7 @@ def first_scales(problem: Problem, start: Estimate) -> Scales:
         step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
         if step is not None:
             residuals.setdefault("steps", []).append(step.residual(a, b))
-    return start.scales.renewed(residuals)
+    return residuals
 
 
 def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterable[Block]:

@@ -423,7 +423,7 @@ def posterior(part: Recording, problem: Problem, solution: Solution, shape: np.n
 
 def _factors(part: Recording, problem: Problem, solution: Solution) -> Scales:
     """The variance factors of the observations."""
-    found = variance_factors(problem, linearise(problem, solution), solution.scales)
+    found = variance_factors(problem, solution)
     own = [p.sigma_m for p in part.points if len(p.sigma_m)]
     wider = _correlated(part.fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
     return replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)

@@ -90,7 +90,7 @@ def _collisions(state, rng):
 def _empty(camera: Camera, joints: int, rng) -> BackgroundExclusion:
     """DistanceMap that rise evenly to the right and downwards: without the kinks between the nodes of a real table."""
     rise = 0.05 * np.arange(201)[None, :] + 0.03 * np.arange(151)[:, None]
-    view = DistanceMap(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
+    view = DistanceMap(camera=camera, table=rise, step_px=4.0, first_px=0.0)
     return BackgroundExclusion(
         views=[view, view],
         head=np.arange(joints),
