@@ -35,6 +35,7 @@ MAX_DAMPING = 1e6  # no step lowers the sum of squares any more
 DELAY = 16  # index of the delay among the unknowns of a camera
 DELAY_SIGMA = 1.0  # images, of all cameras but the first
 FIRST_DELAY_SIGMA = 1e-6
+FIXED_SIGMA = 1e-6  # of an unknown that its camera does not have, and that is always 0
 CONVERGED = 1e-4  # decrease of the sum of squares in units of σ0² per unknown
 
 

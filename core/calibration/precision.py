@@ -5,11 +5,14 @@
     ΔX_i − (τ + θ × X_i) → min over τ, θ                                         (3)   errors beyond a rigid motion of the whole
 
     P = Q_r ⊕ 0 + [K; I] Σ [K; I]ᵀ ,   K = Q_rl Q_ll⁻¹                          (4)   l: unknowns that were left out, r: the others
-    Σ = max(0, F − 1) Q_gg for each group g of them ,   F = xᵀ Q_gg⁻¹ x / m      (5)
+    Σ = τ Q_gg for each group g of them ,   τ = max(0, F − 1) ,   F = xᵀ Q_gg⁻¹ x / m      (5)
+    1 + τ = b γ(a, b) / γ(a + 1, b) ,   a = m / 2 ,   b = m F / 2                   (6)   coefficients of a fisheye lens
 
 (4) is the effect of left-out unknowns of covariance Σ on the others (Schmidt 1966, "consider" parameters); with Σ = Q_ll it is the
-covariance of the adjustment in which all are free. As E F = 1 + λ / m, F − 1 in (5) is the unbiased estimate of the size of a group beyond
-its noise, and its positive part the empirical Bayes variance (Efron & Morris 1973).
+covariance of the adjustment in which all are free. As E F = 1 + λ / m, F − 1 in (5) is the unbiased estimate of the size of a group
+beyond its noise, and its positive part the empirical Bayes variance (Efron & Morris 1973). The four coefficients of a fisheye lens describe
+one curve and replace one another: that one of them is small by itself proves nothing. (6), with incomplete gamma functions, is its mean
+size for x ~ N(0, (1 + τ) Q_gg) and 1 / (1 + τ) uniform between 0 and 1 (Strawderman 1971, doi:10.1214/aoms/1177693528), never 0.
 
 Mapping through (3) is an S-transformation to the datum of the points themselves (Baarda 1973), so the figures do not depend on the datum.
 """
@@ -21,7 +24,7 @@ import numpy as np
 
 from ..geometry.camera import INTERIOR, Camera, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
-from .bundle import NEAREST_M, Normals, Unknowns, free_network, reduce_to_cameras
+from .bundle import FIXED_SIGMA, NEAREST_M, Normals, Unknowns, free_network, reduce_to_cameras
 from .network import Network
 
 
@@ -51,21 +54,28 @@ def group_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A group of interior unknowns less the expected values (m,), its covariance (m, m) and its columns (m,), all cameras together.
 
-    `off` (C, 10) are all interior unknowns less their expected values, `covariance` (C p, C p) that of the free ones.
+    `off` (C, 10) are all interior unknowns less their expected values, `covariance` (C p, C p) that of the free ones. What a camera's
+    lens does not have is left out: an unknown that is 0 by definition would dilute the others.
     """
     columns = list(unknowns.columns)
-    at = [columns.index(INTERIOR.index(name)) for name in names]
-    index = np.array([c * len(columns) + a for c in range(len(off)) for a in at])
-    return off[:, [INTERIOR.index(name) for name in names]].ravel(), covariance[np.ix_(index, index)], index
+    of_group = [INTERIOR.index(name) for name in names]
+    index = np.arange(len(off))[:, None] * len(columns) + [columns.index(n) for n in of_group]
+    there = unknowns.sigma[:, of_group] > FIXED_SIGMA
+    return off[:, of_group][there], covariance[np.ix_(index[there], index[there])], index[there]
 
 
 def with_left_out(
-    covariance: np.ndarray, unknowns: Unknowns, full: np.ndarray, off: np.ndarray, left_out: Sequence[Sequence[str]]
+    covariance: np.ndarray,
+    unknowns: Unknowns,
+    full: np.ndarray,
+    off: np.ndarray,
+    left_out: Sequence[Sequence[str]],
+    fisheye: bool = False,
 ) -> np.ndarray:
-    """Covariance (16 C, 16 C) of all unknowns when groups of interior unknowns are fixed at their expected values.  (4), (5)
+    """Covariance (16 C, 16 C) of all unknowns when groups of interior unknowns are fixed at their expected values.  (4)–(6)
 
     `covariance` (C p, C p) and `unknowns` are those of the adjustment without the groups, `full` (16 C, 16 C) and `off` (C, 10), values
-    less expected values, those of the adjustment with all unknowns free.
+    less expected values, those of the adjustment with all unknowns free; `fisheye`: of lenses with four coefficients.
     """
     from scipy.linalg import block_diag
 
@@ -77,9 +87,20 @@ def with_left_out(
         return P
     groups = [group_of(off, every, full, names) for names in left_out]
     index = np.concatenate([columns for _, _, columns in groups])
-    excess = block_diag(*(max(0.0, x @ np.linalg.solve(Q, x) / len(x) - 1) * Q for x, Q, _ in groups))
+    curve = [fisheye and set(names) <= {"k1", "k2", "k3", "p1", "p2"} for names in left_out]
+    excess = block_diag(*(_excess(float(x @ np.linalg.solve(Q, x)), len(x), c) * Q for (x, Q, _), c in zip(groups, curve)))
     K = np.linalg.solve(full[np.ix_(index, index)], full[index]).T
     return P + K @ excess @ K.T
+
+
+def _excess(square: float, count: int, of_curve: bool) -> float:
+    """τ of `count` unknowns whose sum of squares is this, in units of their covariance.  (5); of the coefficients of a curve  (6)"""
+    from scipy.special import gammainc
+
+    if not of_curve:
+        return max(0.0, square / count - 1)
+    a, b = count / 2, max(square / 2, 1e-6)
+    return float(b * gammainc(a, b) / (a * gammainc(a + 1, b)) - 1)
 
 
 def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.ndarray) -> np.ndarray:

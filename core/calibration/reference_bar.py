@@ -16,7 +16,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..geometry.camera import INTERIOR
 from .bars import PAIR_TOLERANCE, BarObservations, PairGuesses, agreeing, sampson, try_guesses, undistorted, with_bars
-from .bundle import Adjusted, LevenbergMarquardt, Unknowns, adjust
+from .bundle import FIXED_SIGMA, Adjusted, LevenbergMarquardt, Unknowns, adjust
 from .network import BarNetwork
 
 FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
@@ -35,7 +35,6 @@ TILT = np.tan(np.radians(25))  # of a bar that is upright in the image
 RADIAL_SIGMA = (0.5, 0.3, 0.15)  # k1 ρ², k2 ρ⁴, k3 ρ⁶ at the corner, ρ in units of f
 DECENTRING_SIGMA = 0.01  # p ρ
 AFFINITY_SIGMA = 0.01
-NOTHING = 1e-6  # of an unknown that is always 0
 CENTRE_SIGMA = 0.08  # of the image width
 FOCAL_SIGMA = 1.5  # of f
 
@@ -53,7 +52,7 @@ def lens_prior(size_px: np.ndarray, focal_px: np.ndarray, fisheye: np.ndarray | 
         sigma[:, 3 + n] = part / rho ** (2 * n + 2)
     sigma[:, 6:8] = DECENTRING_SIGMA / rho[:, None]
     curved = np.broadcast_to(fisheye, C)
-    sigma[curved, 6], sigma[curved, 7] = RADIAL_SIGMA[-1] / rho[curved] ** 8, NOTHING
+    sigma[curved, 6], sigma[curved, 7] = RADIAL_SIGMA[-1] / rho[curved] ** 8, FIXED_SIGMA
     sigma[:, 8:10] = AFFINITY_SIGMA
     return Unknowns(free=np.ones(len(INTERIOR), dtype=bool), expected=expected, sigma=sigma)
 

@@ -319,7 +319,9 @@ def without_insignificant(
         sigma0_px=sigma,
         redundancy=redundancy,
         covariance=covariance,
-        considered=with_left_out(_in_step(covariance, unknowns), unknowns.in_step, full, first.interior - all_free.expected, left_out),
+        considered=with_left_out(
+            _in_step(covariance, unknowns), unknowns.in_step, full, first.interior - all_free.expected, left_out, bool(first.curved.any())
+        ),
         decisions=tuple(decisions),
         converged=state.converged,
     )

@@ -1,6 +1,8 @@
 """An empty Blender file for every test of the scene, and a small run's results written with core's own writers."""
 
 import importlib.util
+import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +59,14 @@ class NeedsBlender(pytest.Module):
 def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
     """Modules of this folder import bpy; without it they are not imported."""
     return NeedsBlender.from_parent(parent, path=module_path) if importlib.util.find_spec("bpy") is None else None
+
+
+@pytest.fixture(autouse=True)
+def no_mappings_of_other_tests() -> None:
+    """The extension finds the mapping of a rig again that was used last, also in another test."""
+    shutil.rmtree(
+        Path(os.environ["BLENDER_USER_RESOURCES"]) / "extensions" / ".user" / "user_default" / "tricap" / "mappings", ignore_errors=True
+    )
 
 
 @pytest.fixture

@@ -119,6 +119,23 @@ def test_scripts_in_the_file_of_a_rig_do_not_run(blender: ModuleType, empty: Mod
     assert ran.exists(), "they would run where they are let"
 
 
+def test_two_keys_in_a_million_frames_are_refused(empty: ModuleType) -> None:
+    """Each frame would be posed: a glTF file of 2 kB took hours."""
+    from tricap.addon.retarget.read import action_frames
+    from tricap.core.foundation.errors import InputError
+
+    moving = build_armature(squat(person(), frames=2), "Hero")
+    assert len(action_frames(moving)) == 2
+    curve = moving.animation_data.action.layers[0].strips[0].channelbags[0].fcurves[0]
+    curve.keyframe_points[-1].co[0] = 1e6
+    with pytest.raises(InputError, match="reaches from frame .* to 1e\\+06, with values for"):
+        action_frames(moving)
+    moving.animation_data.nla_tracks.new().strips.new("Strip", 0, moving.animation_data.action)
+    moving.animation_data.action, empty.context.scene.frame_end = None, 1_000_000
+    with pytest.raises(InputError, match="reaches from frame 0 to 1e\\+06"):
+        action_frames(moving)
+
+
 def test_a_map_of_a_stranger_is_data_alone(small_run: SmallRun, tmp_path: Path, ran: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "map.json").write_text(json.dumps({"name": f"__import__('os').mkdir({str(ran)!r})", "bones": {"hips": "__class__"}}))
     write_bvh(tmp_path / "rig.bvh", squat(person(), frames=2))

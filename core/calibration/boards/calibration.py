@@ -38,6 +38,7 @@ LONG_RUN = 3  # images one after another in which a camera does not agree: it wa
 FEWEST_SIDE = 3  # views before and after a camera was moved
 STEP_T = 6.0  # Student's t of its residuals, the largest of all frames
 STEP_PART = 0.3  # of sigma0 by which they must change
+CLEAR_T, CLEAR_PART = 4.0, 0.75  # the same for a large change, which few views support
 MOST_LISTED = 8  # frames
 BENT = 0.004  # of the diagonal
 STRETCHED = 1e-3  # makes the scale uncertain by half of it, the limit of a good calibration
@@ -167,7 +168,7 @@ def _remarks_on_moved_cameras(done: Calibration) -> tuple[list[str], list[str]]:
         kept = done.used[rows, c]
         mean_px = np.where(kept[..., None], done.residual_px[rows, c], 0.0).sum(axis=1) / kept.sum(axis=1)[:, None]
         at, t, jump_px = _largest_step(mean_px)
-        if t > STEP_T and jump_px > STEP_PART * done.sigma0_px:
+        if any(t > least and jump_px > part * done.sigma0_px for least, part in ((STEP_T, STEP_PART), (CLEAR_T, CLEAR_PART))):
             frame = done.observations.frames[rows[at]]
             lines.append(f"the residuals of camera {name} change by {jump_px:.2f} px at frame {frame}")
             found.append((t, f"camera {name}, or its neighbour, seems to have been moved before frame {frame}"))

@@ -27,10 +27,13 @@ LAYER = "AnimationLayer"
 MOST_UNPACKED = 100_000_000  # bytes
 MOST_RATIO = 100  # times its size, for larger files
 PIECE = 1 << 20
+PICTURES = {("Texture", "FileName"), ("Texture", "RelativeFilename"), ("Video", "Filename"), ("Video", "RelativeFilename")}
+LONGEST_NAME = 4096
 
 
 def check_fbx(path: Path) -> None:
-    """Check that a file does not ask for far more than it contains. One that is not binary is left to Blender, which refuses it.
+    """Check that a file does not ask for far more than it contains, nor names what is no file as a picture, such as a pipe, for which the
+    importer would wait. One that is not binary is left to Blender, which refuses it.
 
     Raises:
         InputError: it does, or is damaged.
@@ -40,6 +43,8 @@ def check_fbx(path: Path) -> None:
             if file.read(len(MAGIC)) == MAGIC:
                 walk = _Walk(file, path)
                 walk.all()
+                for name in walk.pictures:
+                    _check_picture(path.parent, name)
                 if max(_paths(walk.joined), _actions(walk.joined, walk.layers)) > MOST_PATHS:
                     raise InputError(f"{path} connects its objects in more than {MOST_PATHS} ways; export the rig alone.")
     except (OSError, ValueError, struct.error, zlib.error, RecursionError) as error:
@@ -55,6 +60,7 @@ class _Walk:
         self._unpacked = self._objects = 0
         self.joined: list[tuple[int, int]] = []  # the objects that are connected, by their numbers: child and parent
         self.layers: set[int] = set()  # the numbers of the animation's layers
+        self.pictures: set[str] = set()  # the names of their files
 
     def all(self) -> None:
         """Every record of the file."""
@@ -77,7 +83,8 @@ class _Walk:
         self._objects += parent == "Objects" and name not in MANY
         if self._objects > MOST_OBJECTS:
             raise InputError(f"{self._path} has more than {MOST_OBJECTS} objects; export the rig alone.")
-        numbers = [found for _ in range(values) if (found := self._value(end)) is not None]
+        named = (parent, name) in PICTURES
+        numbers = [found for _ in range(values) if (found := self._value(end, named)) is not None]
         if parent == "Connections" and len(numbers) > 1:
             self.joined.append((numbers[0], numbers[1]))
         if name == LAYER:
@@ -88,8 +95,8 @@ class _Walk:
             raise ValueError("a record that does not end where it claims to")
         return True
 
-    def _value(self, end: int) -> int | None:
-        """Pass a value; returns it if it is a number of an object."""
+    def _value(self, end: int, named: bool) -> int | None:
+        """Pass a value; returns it if it is a number of an object. `named`: texts are names of pictures."""
         kind = self._file.read(1).decode("latin-1")
         if kind in ARRAYS:
             count, packed, length = self._read("<III")
@@ -98,7 +105,10 @@ class _Walk:
         elif kind and kind in TEXTS:
             (length,) = self._read("<I")
             self._fits(length, end)
-            self._file.seek(length, 1)
+            if named and length <= LONGEST_NAME:
+                self.pictures.add(self._file.read(length).decode(errors="replace"))
+            else:
+                self._file.seek(length, 1)
         elif kind == "L":
             return self._read("<q")[0]
         elif kind in SINGLE:
@@ -119,6 +129,18 @@ class _Walk:
         found = _unpacked_size(data, claimed) if packed else len(data)
         if found != claimed:
             raise ValueError("an array whose length is not as it claims")
+
+
+def _check_picture(folder: Path, name: str) -> None:
+    """A picture may lie anywhere, as on the machine that wrote the file, but what is there must be a file.
+
+    Raises:
+        OSError: it is something else.
+    """
+    plain = name.replace("\\", "/").replace("\0", "")
+    for place in (Path(plain), folder / plain, folder / plain.lstrip("/"), folder / Path(plain).name):
+        if place.name and place.exists() and not place.is_dir():
+            bounded.check_file(place, bounded.ARRAYS_BYTES)
 
 
 def _actions(joined: list[tuple[int, int]], layers: set[int]) -> int:

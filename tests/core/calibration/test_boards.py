@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tricap.core.calibration.boards.board import Board, BoardKind, Lens
+from tricap.core.calibration.boards.calibration import _remarks_on_moved_cameras
 from tricap.core.calibration.boards.detection import Variant, find_corners, find_variant
 from tricap.core.calibration.boards.footage import _even
 from tricap.core.calibration.boards.observations import BoardObservations
@@ -165,6 +166,18 @@ def test_a_moved_camera_is_never_good(turned: float, said: str) -> None:
     xy[18:, 1] = np.where(np.isfinite(xy[18:, 1]), seen + np.random.default_rng(1).normal(0, 0.1, seen.shape), np.nan)
     done = calibrate_rig(observed(replace(held, xy_px=xy)), Monitor())
     assert done.verdict.light != "green" and said in done.verdict.sentence
+
+
+def test_a_large_change_that_few_views_support_is_never_good() -> None:
+    """A camera moved after few positions has shown too little for t > 6; its residuals change by more than those of clean sets."""
+    held = drawn(0, 20, sigma_px=0.1)
+    done = calibrate_rig(observed(held), Monitor())
+    assert not _remarks_on_moved_cameras(done.calibration)[1]
+    residual_px = done.calibration.residual_px.copy()
+    early = np.argsort(done.calibration.observations.frames)[:4]
+    residual_px[early, 1] += np.random.default_rng(0).normal(0.15, 0.1, (4, 1, 1))
+    doubts = _remarks_on_moved_cameras(replace(done.calibration, residual_px=residual_px))[1]
+    assert len(doubts) == 1 and "moved before frame 4" in doubts[0]
 
 
 def test_two_cameras_that_disagree_are_never_good() -> None:

@@ -1,5 +1,6 @@
 """What Blender's importers would make of a small FBX or glTF file is counted before they read it."""
 
+import os
 import struct
 import time
 from pathlib import Path
@@ -135,3 +136,20 @@ def test_a_sound_gltf_file_is_let_through(tmp_path: Path) -> None:
     for uri in ("a%20%C3%A9.bin", "data:application/octet-stream;base64,AAAA", "missing.bin"):
         check_gltf(write_gltf(tmp_path / "a.gltf", buffers=[{"byteLength": 36, "uri": uri}]))
     check_gltf(write_gltf(tmp_path / "a.glb"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes are elsewhere on Windows")
+@pytest.mark.parametrize("kind", ["Texture", "Video"])
+@pytest.mark.parametrize("name", ["{folder}/pipe", "pipe", "sub\\\\..\\\\pipe", "/dev/zero", "gone/pipe"])
+def test_pictures_of_an_fbx_file_are_files(tmp_path: Path, kind: str, name: str) -> None:
+    """Blender's importer waits for ever for a pipe."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "sub").mkdir()
+    named = [text(name.format(folder=tmp_path).encode())]
+    inner = [record(b"RelativeFilename", named), record(b"FileName" if kind == "Texture" else b"Filename", named)]
+    objects = [model(1), record(kind.encode(), [number(5), text(b"t")], inner)]
+    with pytest.raises(InputError, match="it is a device, a pipe or a socket"):
+        check_fbx(write_fbx(tmp_path / "a.fbx", objects))
+    if name == "pipe":
+        (tmp_path / "pipe").unlink()
+        check_fbx(write_fbx(tmp_path / "a.fbx", objects))  # what is missing, Blender tells
