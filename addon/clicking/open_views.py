@@ -112,9 +112,8 @@ def draw_back(header: bpy.types.Header, context: bpy.types.Context) -> None:
     if not BackToSteps.poll(context) or not mine or context.area != min(mine, key=lambda a: (-a.y, a.x)):
         return
     header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
-    session = get_session()
-    now = session.file.step_states.get(context.scene.name_full)
-    if now is not None and now.can_run and session.job is None:
+    now = get_session().file.step_states.get(context.scene.name_full)
+    if now is not None and now.can_run and not context.window_manager.tricap.blocks:  # a check gives way
         header.layout.operator("tricap.back_to_steps", icon="FF", text="Run Remaining Steps").run = True
 
 

@@ -530,22 +530,28 @@ def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: 
     assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 fps.")
 
 
-def test_the_remaining_steps_are_run_from_the_views(blender: ModuleType, sample: Path, layout: Any, tmp_path: Path) -> None:
+def test_the_remaining_steps_are_run_from_the_views(
+    blender: ModuleType, sample: Path, layout: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Beside Back to Steps above the first view, where a run can begin; the operator goes back first."""
     views, watch = (importlib.import_module(f"{NAME}.{name}") for name in ("clicking.open_views", "steps.watch"))
     scene, window = opened(blender, sample, tmp_path), blender.context.window_manager.windows[0]
     area = max(window.screen.areas, key=lambda area: area.width * area.height)
     area.type = "CLIP_EDITOR"
     area.spaces.active.clip = scene.tricap.views[0].clip
-    offered = []
-    for name in ("Mine", views.NAME):
+    session, offered = importlib.import_module(f"{NAME}.session").get_session(), []
+    check, stage = (SimpleNamespace(job=object(), gives_way=gives_way) for gives_way in (True, False))
+    for name, job_operator in (("Mine", None), (views.NAME, None), (views.NAME, check), (views.NAME, stage)):
         window.workspace.name = name
         assert watch.refresh(scene).can_run
+        monkeypatch.setattr(session, "job_operator", job_operator)
         with blender.context.temp_override(window=window, area=area):
             header = SimpleNamespace(layout=type(layout)())
             views.draw_back(header, blender.context)
             offered.append(header.layout.operators)
-    assert offered == [[], ["tricap.back_to_steps", "tricap.back_to_steps"]]
+    monkeypatch.undo()
+    both = ["tricap.back_to_steps", "tricap.back_to_steps"]
+    assert offered == [[], both, both, ["tricap.back_to_steps"]], "also while a check runs, which gives way; not during another job"
     (tmp_path / "take" / "rig.toml").unlink()
     with pytest.raises(RuntimeError, match=r"rig\.toml"):  # it runs
         blender.ops.tricap.back_to_steps(run=True)
