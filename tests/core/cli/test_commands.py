@@ -63,7 +63,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "unknown key": (lambda t: edit(t, "fps", "fqs"), "unknown key “fqs”. Did you mean “fps”?"),
     "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), 'version = 1; it has "tricap-take" and 7'),
     "a folder for a pattern": (lambda t: edit(t, "L/*.png", "L"), "“L” is a folder; write “L/*.png”"),
-    "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), "`offset_frames` of view 'L' of"),
+    "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), '`offset_frames` of view "L" of'),
     "offset in parts": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = 1.5\n'), "is 1.5; write a whole number"),
     "offset endless": (lambda t: edit(t, 'name = "L"\n', f'name = "L"\noffset_frames = {10**15}\n'), "write a whole number of frames"),
     "path outside": (lambda t: edit(t, "L/*.png", "../L/*.png"), "lies outside the take"),

@@ -157,7 +157,7 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     (y, x) = (picture[..., 2] - picture[..., 0] > 100).nonzero()  # red: the path from before frame 1 on, the cross and the name
     at = {p["frame"]: float(p["x"]) for p in pixels if p["view"] == "C"}
     assert x.min() < at["1"] and len(y) > 10
-    assert main([*command, "--pictures", str(take)]) == 2 and "is itself a take" in capsys.readouterr().err
+    assert main([*command, "--pictures", str(take)]) == 2 and "is also an input" in capsys.readouterr().err
     (take / "L").rename(tmp_path / "L")
     (take / "L").symlink_to(tmp_path / "L")
     assert main([*command, "--pictures", str(tmp_path)]) == 2 and "contains the footage" in capsys.readouterr().err
