@@ -45,6 +45,7 @@ def _wand(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
         layout.prop(props, "first_field")
     layout.prop(props, "diameter_m")
     layout.prop(props, "mask")
+    layout.prop(props, "lens")
 
 
 def _board(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:

@@ -18,6 +18,7 @@ from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, LaterPart, open_sequence, read_image
 from . import report, verdict
+from .bar_lenses import calibrate_bar
 from .bars import BarObservations
 from .boards.board import Lens
 from .boards.calibration import calibrate_boards
@@ -25,7 +26,7 @@ from .boards.footage import BoardFootage, numbered
 from .boards.observations import BoardObservations
 from .quality import Quality, assess
 from .report import pictures
-from .self_calibration import Calibration, calibrate
+from .self_calibration import Calibration
 from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
 from .world_frame import WorldChoice, frame_of_bar
 
@@ -279,9 +280,7 @@ def calibrate_rig(
     """
     world = world or WorldChoice()
     if isinstance(observations, BarObservations):
-        if lens is Lens.FISHEYE:
-            raise InputError("A fisheye lens cannot be calibrated with a bar; film a printed board, and give --board (in Blender: Target).")
-        calibration = calibrate(observations, monitor, focal_px)
+        calibration = calibrate_bar(observations, monitor, focal_px, lens)
     else:
         calibration = calibrate_boards(observations, monitor, focal_px, lens)
     verdict.refuse_if_useless(calibration)

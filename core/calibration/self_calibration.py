@@ -36,6 +36,7 @@ from .bundle import (
     residuals_of,
 )
 from .delays import MovingPoints, first_delays, in_order, moving_points, without_jumps
+from .fisheye_bar import fisheye_network
 from .network import BarNetwork, Network, Observations
 from .precision import camera_covariance, group_of, with_left_out
 from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_prior
@@ -88,8 +89,8 @@ class Calibration:
         return replace(self.unknowns.in_step, free=np.ones(len(INTERIOR), dtype=bool))
 
 
-def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
-    """Calibrate the cameras from image points and the bar's length alone.
+def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None, fisheye: bool = False) -> Calibration:
+    """Calibrate the cameras from image points and the bar's length alone; `fisheye`: all of them have such lenses.
 
     Raises:
         InputError: the cameras share too few bars.
@@ -97,26 +98,27 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     monitor.step("calibration", 0, 5)
     raw = without_jumps(observations.frames, observations.xy_px)
     moving = moving_points(observations.frames, raw)
-    late = first_delays(moving, observations.size_px, observations.labelled)
-    done = _at_delays(observations, raw, late, monitor, focal_px) if late.any() else None
+    none = np.zeros(len(observations.names))  # the search needs lenses that keep lines nearly straight
+    late = none if fisheye else first_delays(moving, observations.size_px, observations.labelled)
+    done = _at_delays(observations, raw, late, monitor, focal_px, fisheye) if late.any() else None
     if done is None:
-        done = _at_delays(observations, raw, np.zeros(len(late)), monitor, focal_px)
+        done = _at_delays(observations, raw, none, monitor, focal_px, fisheye)
     assert done is not None
     return done
 
 
 def _at_delays(
-    observations: BarObservations, raw_px: np.ndarray, late_images: np.ndarray, monitor: Monitor, focal_px: float | None
+    observations: BarObservations, raw_px: np.ndarray, late_images: np.ndarray, monitor: Monitor, focal_px: float | None, fisheye: bool
 ) -> Calibration | None:
     """The calibration that starts from delays (C,); None if these are not 0 and turn out not to be significant: they moved the points."""
     moving = moving_points(observations.frames, raw_px)
     if late_images.any():
         observations = observations.changed(moving.at(late_images)[0], labelled=observations.labelled)
-    start = initial_network(observations, focal_px)
+    start = (fisheye_network if fisheye else initial_network)(observations, focal_px)
     monitor.step("calibration", 1, 5)
     network, labelled, sigma = refined_start(start.network, observations)
     monitor.step("calibration", 2, 5)
-    prior = lens_prior(observations.size_px, network.interior[:, 0])
+    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
     first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     monitor.step("calibration", 3, 5)
@@ -178,7 +180,7 @@ def coarse_adjustment(network: AnyNetwork, xy_px: np.ndarray, used: np.ndarray, 
 
 def refined_start(network: BarNetwork, observations: BarObservations) -> tuple[BarNetwork, BarObservations, float]:
     """The cameras, adjusted with all unknowns on a part of the positions; all observations with their ends in order; sigma [px]."""
-    prior = lens_prior(observations.size_px, network.interior[:, 0])
+    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
     some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
     cauchy = COARSE_CAUCHY_PX
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):

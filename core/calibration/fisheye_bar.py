@@ -1,0 +1,77 @@
+"""Initial values of cameras with fisheye lenses from a waved bar.
+
+For each guess of the focal length, the image points are those of an equidistant lens, θ = r / f, and are mapped to a central projection:
+
+    x' = c + f tan(θ) (x − c) / r ,   θ < NARROW                                                 (1)
+
+The search for cameras without such lenses (`reference_bar`) finds the poses from these points; they are adjusted with the fisheye lens and
+the original points, and the guess with the smallest robust sum of squares wins.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from .bars import BarObservations, labelled_ends, with_bars
+from .bundle import Adjusted, LevenbergMarquardt, adjust
+from .network import BarNetwork
+from .reference_bar import COARSE_CAUCHY_PX, GATE, ROUGH_FOCALS, WIDE_GATE, initial_network, lens_prior
+
+FOCAL_PARTS = np.geomspace(0.22, 0.8, 7)  # focal lengths in widths
+NARROW = np.radians(65)  # from the axis: points further out are not used for the start
+POSITIONS = 120
+
+
+def fisheye_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted[BarNetwork]:
+    """The best start, adjusted on a part of the positions.
+
+    Raises:
+        InputError: the cameras share too few bars.
+    """
+    grid = focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_PARTS * float(np.median(observations.size_px[:, 0]))
+    best: Adjusted[BarNetwork] | None = None
+    problem: InputError | None = None
+    for f in grid:
+        try:
+            flat = initial_network(_flat(observations, float(f)), float(f))
+        except InputError as error:
+            problem = error
+            continue
+        trial = _trial(observations, flat.network, float(f))
+        if best is None or trial.cost < best.cost:
+            best = trial
+    if best is None:
+        assert problem is not None
+        raise problem
+    return best
+
+
+def _flat(observations: BarObservations, focal_px: float) -> BarObservations:
+    """The observations as those of a central projection, without points far from the axis.  (1)"""
+    middle = (observations.size_px[:, None] - 1) / 2  # (C, 1, 2)
+    from_middle = observations.xy_px - middle
+    theta = np.linalg.norm(from_middle, axis=-1, keepdims=True) / focal_px
+    with np.errstate(invalid="ignore"):
+        stretch = np.where(theta < NARROW, np.tan(theta) / np.maximum(theta, 1e-9), np.nan)
+    return observations.changed(middle + from_middle * stretch, labelled=observations.labelled)
+
+
+def _trial(observations: BarObservations, flat: BarNetwork, focal_px: float) -> Adjusted[BarNetwork]:
+    """A short robust adjustment of fisheye lenses from the poses of a network of other cameras."""
+    interior = np.zeros_like(flat.interior)
+    interior[:, 0], interior[:, 1:3] = focal_px, (observations.size_px - 1) / 2
+    network = replace(flat, interior=interior, fisheye=np.ones(len(interior), dtype=bool))
+    some = observations.part(np.unique(np.linspace(0, len(observations.xy_px) - 1, POSITIONS).astype(int)))
+    prior = lens_prior(some.size_px, interior[:, 0], network.fisheye).only("f", "k1")
+    for gate in (4 * WIDE_GATE, WIDE_GATE, GATE):
+        tolerance = gate * COARSE_CAUCHY_PX
+        part = some if some.labelled else labelled_ends(network, some, tolerance)
+        network, used = with_bars(network, part, tolerance)
+        done = adjust(
+            network, part.xy_px, used, prior, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3,
+            iteration=LevenbergMarquardt(max_iterations=8, tolerance=1e-2),
+        )  # fmt: skip
+        network = done.network
+    left_out = int(part.visible.sum() - used.sum())
+    return replace(done, cost=done.cost + left_out * COARSE_CAUCHY_PX**2 * float(np.log1p(GATE**2)))
