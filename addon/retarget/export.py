@@ -128,7 +128,14 @@ def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:
         xyz, sigma = (np.stack([column[name] for name in names], axis=1) for column in (table.joints_m, table.sigma_m))
         words = tuple(zip(*(table.known[name] for name in names)))
         known = words if all(all(row) for row in words) else ()
-        return Markers(names=names, fps=rate(table.frames, table.time_s, out / "joints.csv"), frames=table.frames, xyz_m=xyz, sigma_m=sigma, known=known)
+        return Markers(
+            names=names,
+            fps=rate(table.frames, table.time_s, out / "joints.csv"),
+            frames=table.frames,
+            xyz_m=xyz,
+            sigma_m=sigma,
+            known=known,
+        )
     return heads_of(read_motion_source(out, up=up, unit=unit))
 
 

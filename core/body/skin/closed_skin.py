@@ -33,6 +33,7 @@ from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
 from .ends import caged, rounded
+from .limb_weights import with_limb_borders
 from .mesh import SkinSettings, corner_uv, refined
 from .welding import cut, welded
 from .whole_surface import WholeSurface
@@ -226,7 +227,7 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     coarse = _sparse(whole.vertices_m, faces, part, surface) & ~whole.end
     uneven = np.setdiff1d(np.union1d(free, within(near, coarse, SEAM_RINGS)), np.flatnonzero(whole.end))
     vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, part, surface), faces, near, free)
-    weights = _smoothed(whole.weights, vertices, faces, near, free)
+    weights = _smoothed(with_limb_borders(shape, vertices, part, whole.weights), vertices, faces, near, free)
     kept = 1 - np.maximum(loose, whole.end)
     end = whole.end.astype(np.float64)
     for pieces in (settings.detail, detail):

@@ -8,8 +8,11 @@ processing; M, C and the normals n of surface_operators):
     ‖M^(−½) (C x − M h̃ n)‖² + ‖w⁻² M^½ (x − x⁰)‖² → min                                                    (2)
 
 A cylinder or a sphere stays as it is, at any radius, where smoothing of positions would shrink it. Heads, hands and feet, made of
-anatomical balls, keep their shape (w → 0, and Δx⁰ in place of h̃ n), with a smooth transition.
+anatomical balls, keep their shape (w → 0, and Δx⁰ in place of h̃ n), with a smooth transition. Applied again, with smaller widths, to the
+skin with relief, whose points are 1 cm apart: a finer wave is noise, and an edge is left over from a fold of the skin at a joint.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,9 +21,18 @@ from .extremities import TABLES
 from .fingers import FINGER_BONE
 from .surface_operators import factorised, laplacian, vertex_normals
 
-CURVATURE_M = 0.05  # ℓ of (1)
-WIDTH_M = 0.09  # w of (2): waves shorter than some 2π w vanish if the smoothed curvature has none
-ANATOMICAL_M = 0.006  # w at heads, hands and feet
+
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """ℓ of (1), w of (2), and w at heads, hands and feet [m]; waves shorter than some 2π w vanish if the smoothed curvature has none."""
+
+    curvature: float
+    tie: float
+    anatomical: float
+
+
+OF_BALLS = Widths(0.05, 0.09, 0.006)
+OF_RELIEF = Widths(0.015, 0.008, 0.003)
 STEPS = 2  # the second with the normals of the first
 
 
@@ -32,17 +44,17 @@ def anatomical(shape: BodyShape, weights: np.ndarray) -> np.ndarray:
     return np.asarray(weights[:, own].sum(axis=1))
 
 
-def faired(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def faired(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray, widths: Widths = OF_BALLS) -> np.ndarray:
     """Vertices (V, 3) of the fair surface; `kept` (V,) 0 to 1: to what degree each keeps its place.  (1), (2)"""
     from scipy import sparse
 
     found = vertices
-    tie = np.exp((1 - kept) * np.log(WIDTH_M) + kept * np.log(ANATOMICAL_M)) ** -4
+    tie = np.exp((1 - kept) * np.log(widths.tie) + kept * np.log(widths.anatomical)) ** -4
     for _ in range(STEPS):
         C, area = laplacian(found, faces)
         M, normals = sparse.diags(area), vertex_normals(found, faces)
         h = np.einsum("vk,vk->v", normals, C @ found) / area
-        smooth = factorised(M - CURVATURE_M**2 * C).solve(area * h)
+        smooth = factorised(M - widths.curvature**2 * C).solve(area * h)
         wanted = kept[:, None] * (C @ found) / area[:, None] + ((1 - kept) * smooth)[:, None] * normals
         normal = C.T @ sparse.diags(1 / area) @ C
         right = C.T @ wanted + (tie * area)[:, None] * vertices

@@ -17,8 +17,9 @@ from ...foundation.progress import Monitor
 from ..shape import BodyShape
 from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
-from .fairing import anatomical, faired
+from .fairing import OF_RELIEF, anatomical, faired
 from .fingers import RIGID_BONE
+from .head_place import with_head_in_place
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
 from .relief import SurfacePoints, directions, measured_relief
@@ -39,11 +40,16 @@ def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
     skin = one_skin(shape, settings, DETAIL)
     if not settings.fair:
         return skin
+    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, _kept(skin, shape)))
+
+
+def _kept(skin: OneSkin, shape: BodyShape) -> np.ndarray:
+    """(V,) 0 to 1: to what degree vertices keep their places when the skin is faired."""
     kept = anatomical(shape, skin.weights)
     if skin.rays:  # a limb alone: its ends are no part of a surface that goes on
         from_end = np.min([np.linalg.norm(skin.vertices_m - skin.vertices_m[pole], axis=1) for pole in (0, -1)], axis=0)
         kept = np.maximum(kept, 1 - smooth(from_end / END_M - 1))
-    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, kept))
+    return kept
 
 
 def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mirror: bool, monitor: Monitor) -> OneSkin:
@@ -52,10 +58,12 @@ def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mi
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    relief = measured_relief(skin, shape, frames, mirror, monitor)
-    moved = skin.vertices_m + relief.displacement_m[:, None] * directions(skin, shape)
+    skin = with_head_in_place(skin, shape, frames)
+    relief, along = measured_relief(skin, shape, frames, mirror, monitor), directions(skin, shape)
+    moved = faired(skin.vertices_m + relief.displacement_m[:, None] * along, skin.faces, _kept(skin, shape), OF_RELIEF)
     moved = unflipped(moved, skin.faces, np.ones(len(moved), dtype=bool))
-    return replace(skin, vertices_m=moved, relief_m=relief.displacement_m, sigma_m=relief.sigma_m)
+    displacement = np.einsum("vk,vk->v", moved - skin.vertices_m, along)
+    return replace(skin, vertices_m=moved, relief_m=displacement, sigma_m=relief.sigma_m)
 
 
 def cage(skin: OneSkin) -> tuple[np.ndarray, np.ndarray]:
