@@ -2,7 +2,8 @@
 
 The anatomical head (ends) has the place and size of the fitted balls, whose face is no better than an ellipsoid's: nose and chin may lie
 centimetres beside the person's, and a relief would then give the chin the shape of a mouth. In the axes of the head's bone the vertices x
-move by a similarity of six parameters p, a shift up and ahead, a pitch, and three scales, to the degree w to which they are the head's, smoothed over the neck:
+move by a similarity of six parameters p, a shift up and ahead, a pitch, and three scales, to the degree w to which they are the head's,
+smoothed over the neck:
 
     x' = x + w (S Q(x − c) + c + t − x) ,   Σ ρ( m·(X − x')/σ ) + Σ (p/σ_p)² → min                           (1)
 
