@@ -2,7 +2,8 @@
 
 The anatomical head (ends) has the place and size of the fitted balls, whose face is no better than an ellipsoid's: nose and chin may lie
 centimetres beside the person's, and a relief would then give the chin the shape of a mouth. In the axes of the head's bone the vertices x
-move by a similarity of six parameters p, a shift up and ahead, a pitch, and three scales, to the degree w to which they are the head's:
+move by a similarity of six parameters p, a shift up and ahead, a pitch, and three scales, to the degree w to which they are the head's,
+smoothed over the neck:
 
     x' = x + w (S Q(x − c) + c + t − x) ,   Σ ρ( m·(X − x')/σ ) + Σ (p/σ_p)² → min                           (1)
 
@@ -21,7 +22,7 @@ from ..skeleton import bone_frames
 from .closed_skin import OneSkin
 from .ends import HEAD
 from .extremities import has_end
-from .relief import LEAST_COSINE, SurfacePoints
+from .relief import LEAST_COSINE, Nearby, SurfacePoints
 from .surface_operators import vertex_normals
 
 PRIOR = np.array([0.03, 0.015, 0.15, 0.10, 0.10, 0.10])  # σ_p: up and ahead [m], pitch [rad], ln of the scales to the side, up, ahead
@@ -48,7 +49,8 @@ def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[Surface
         return skin
     middle, vertices = local[own > OWN].mean(axis=0), vertex_normals(skin.vertices_m, skin.faces) @ R[b]
     p = _registered(local[own > OWN], vertices[own > OWN], middle, points, normals)
-    moved = local + own[:, None] * (_moved(local, middle, p) - local)
+    share = Nearby(skin.vertices_m, skin.faces).mean(own[:, None])  # wider than the weights, or the throat would fold
+    moved = local + share * (_moved(local, middle, p) - local)
     return replace(skin, vertices_m=head[b] + moved @ R[b].T)
 
 

@@ -105,7 +105,7 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     poser, normals = Poser(shape, skin.weights), directions(skin, shape)
     size, fingers = _prior_sigma(shape, skin), _fingers(shape, skin)
     gate = np.where(fingers < 0.5, GATE * np.maximum(size, PRIOR_M * _share(shape, skin, (HEAD,))), 0.0)
-    prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
+    prior, nearby = _prior(skin.vertices_m, skin.faces, size), Nearby(skin.vertices_m, skin.faces)
     delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
     smoothed = anatomical(shape, skin.weights)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
@@ -126,7 +126,7 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     return Relief(displacement_m=(1 - fingers) * delta, sigma_m=np.hypot((1 - fingers) * sigma, fingers * size))
 
 
-class _Nearby:
+class Nearby:
     """Means over the neighbourhood of every vertex, by diffusion."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -150,7 +150,7 @@ class _Nearby:
 def directions(skin: OneSkin, shape: BodyShape) -> np.ndarray:
     """(V, 3) along which a skin is displaced: its normals, at head, hands and feet those of the surface without nose, ears and toes."""
     normals = vertex_normals(skin.vertices_m, skin.faces)
-    smooth = _Nearby(skin.vertices_m, skin.faces).mean(normals)
+    smooth = Nearby(skin.vertices_m, skin.faces).mean(normals)
     return _mixed(normals, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), anatomical(shape, skin.weights))
 
 
@@ -219,7 +219,7 @@ def _observed(
     return _Observed(vertex=hit, d=np.bincount(at, weight * d) / total, variance=1 / total)
 
 
-def _adjusted(prior: "sparse.csc_matrix", nearby: "_Nearby", seen: _Observed, reweightings: int) -> tuple[np.ndarray, Any, np.ndarray]:
+def _adjusted(prior: "sparse.csc_matrix", nearby: "Nearby", seen: _Observed, reweightings: int) -> tuple[np.ndarray, Any, np.ndarray]:
     """δ (V,) of (2), the factorised normal matrix, and the observations' weights (M,)."""
     count, robust = prior.shape[0], np.ones(len(seen.d))
     spread = np.full(len(seen.d), START_SIGMA_M)

@@ -82,9 +82,9 @@ def test_the_head_moves_to_the_measured_face() -> None:
     R, _ = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
     b = list(skin.bone_names).index("head")
     moved = np.median((found.vertices_m - skin.vertices_m)[head] @ R[b], axis=0)
-    assert np.abs(moved - [0, HIGHER_M, AHEAD_M]).max() < 0.004
-    others = skin.weights[:, b] == 0
-    assert np.allclose(found.vertices_m[others], skin.vertices_m[others], atol=1e-12)
+    assert np.abs(moved - [0, HIGHER_M, AHEAD_M]).max() < 0.005
+    hands = skin.weights[:, [name.startswith("hand") for name in skin.bone_names]].sum(axis=1) > 0.5
+    assert np.abs(found.vertices_m - skin.vertices_m)[hands].max() < 1e-5
 
 
 def test_a_head_with_few_points_stays() -> None:
