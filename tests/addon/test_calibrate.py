@@ -25,7 +25,7 @@ ADDON = "bl_ext.user_default.tricap.addon"
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("calibrate") / "bar"
-    waved = waved_bar(benchmark_cameras(), FRAMES, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    waved = waved_bar(benchmark_cameras(), FRAMES, np.random.default_rng(7), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     write_bar_folder(folder, waved, BarPictures(radius_m=0.015))
     return folder
 
