@@ -52,7 +52,7 @@ DELAY_ROUNDS = 3  # of the first adjustment with delays
 RETRIED_ROUNDS = 2  # in which all image points are tested again
 MIN_SIGMA_PX = 0.004
 DELAY_SIGNIFICANCE = 1e-3
-CONVINCING = 0.7  # of the visible image points: first delays with which fewer fit are compared with none
+CONVINCING = 0.7  # of the visible image points of each camera: first delays with which fewer fit are compared with none
 LEAST_DELAY = 0.01  # images: cameras that are less apart count as in step
 
 
@@ -102,11 +102,17 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     none = np.zeros(len(observations.names))  # the search needs lenses that keep lines nearly straight
     late = none if fisheye else first_delays(moving, observations.size_px, observations.labelled)
     done = _at_delays(observations, raw, late, monitor, focal_px, fisheye) if late.any() else None
-    if done is None or done.used.sum() < CONVINCING * done.observations.visible.sum():  # the delays were found by chance
+    if done is None or not _convincing(done):
         at_once = _at_delays(observations, raw, none, monitor, focal_px, fisheye)
         assert at_once is not None
         done = at_once if done is None or at_once.used.sum() > done.used.sum() else done
     return done
+
+
+def _convincing(found: Calibration) -> bool:
+    """Whether enough image points of every camera fit: delays that were found by chance fit some cameras only."""
+    fit, visible = found.used.sum(axis=(0, 2)), found.observations.visible.sum(axis=(0, 2))
+    return bool((fit >= CONVINCING * visible).all())
 
 
 def _at_delays(

@@ -169,8 +169,11 @@ def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("lines", "first"), [("odd", 0), pytest.param("both", 0, marks=pytest.mark.slow), ("both", 1)])
 def test_an_interlaced_bar(tmp_path: Path, lines: str, first: int) -> None:
-    """The other field holds another instant: only the field's own rows may be used, of both fields each for its own frame."""
-    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(7), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    """The other field holds another instant: only the field's own rows may be used, of both fields each for its own frame.
+
+    The film of one field is short: a delay of −7.5 images fits two of its cameras, and is not believed.
+    """
+    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     per = 2 if lines == "both" else 1
     rng, look = np.random.default_rng(0), BarPictures(radius_m=0.02, reflections=1)
     for c, camera in enumerate(waved.cameras):
