@@ -43,8 +43,12 @@ def _check_silhouettes(footage: Footage, view: int, monitor: Monitor) -> None:
     """
     given, paths = footage.take.views[view], silhouette_files(footage, view, footage.frames)
     chosen = paths[:: max(1, -(-len(paths) // LONGEST))]
+    somebody = not chosen
     for n, path in enumerate(chosen):
         monitor.step(f"checking the masks of {given.name}", n, len(chosen))
         picture = read_picture(path, given.name, footage.sizes_px[view])
         if given.background is None:
-            check_mask(picture, path)
+            check_mask(picture, path, of_all=given.masks is None)
+        somebody = somebody or bool(picture.any())
+    if not somebody and given.masks is not None:
+        raise InputError(f"All masks of view {given.name} are black; paint the person white, or remove `masks` from take.toml.")

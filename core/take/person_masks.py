@@ -38,7 +38,7 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
         if view.background is not None:
             mask = _unlike(picture, image, rows.step)
         else:
-            check_mask(picture, path)
+            check_mask(picture, path, of_all=view.masks is None)
             mask = picture > WHITE
         if mask is not None:
             found.append(Silhouette(camera=camera, rows=rows, mask=mask))
@@ -49,12 +49,14 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
     return tuple(found)
 
 
-def check_mask(picture: np.ndarray, path: Path) -> None:
-    """Refuse a mask (h, w) with a person who is not white.
+def check_mask(picture: np.ndarray, path: Path, *, of_all: bool) -> None:
+    """Refuse a mask (h, w) with a person who is not white. `of_all`: it is for all images, so that somebody is in it.
 
     Raises:
-        InputError: it is neither black nor white anywhere.
+        InputError: it is neither black nor white anywhere, or black everywhere for all images.
     """
+    if of_all and not picture.any():
+        raise InputError(f"The mask {path} is black everywhere; paint white wherever the person comes, or remove `mask` from take.toml.")
     if 0 < picture.max() <= WHITE:
         raise InputError(f"The mask {path} is nowhere brighter than {picture.max():.0f} of 255; paint the person white.")
 

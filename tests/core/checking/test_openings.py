@@ -68,6 +68,11 @@ def link_to_a_device(take: Path) -> None:
     (take / "M" / "1.png").symlink_to("/dev/zero")
 
 
+def black(take: Path) -> None:
+    png(take / "m.png", 0)
+    view(take, 'mask = "m.png"')
+
+
 def another_room(take: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (150, 200), dtype=np.uint8)
     (take / "b.png").write_bytes(cv2.imencode(".png", noise)[1].tobytes())
@@ -79,6 +84,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no masks": (lambda take: view(take, 'masks = "M/*.png"'), "has no images"),
     "too few masks": (lambda take: masks(take, 2), "has 2 masks, but none for frame 2"),
     "a grey mask": (not_white, "nowhere brighter than 100"),
+    "a black mask": (black, "m.png is black everywhere"),
     "a text as a mask": (text_instead, "not a readable image"),
     "a small mask": (of_another_size, "has 20×20 pixels"),
     "no mask": (lambda take: view(take, 'mask = "m.png"'), "Cannot read the image"),
@@ -110,6 +116,11 @@ def test_sound_masks_are_no_finding_and_settings_are_checked(plane_take: Path, t
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))
     masks(take)
     assert opening_findings(open_take(read_take(take)), FitSettings(), Monitor()) == []
+    for i in range(4):
+        png(take / "M" / f"{i}.png", 0)
+    assert [
+        "All masks of view L are black" in f.sentence for f in opening_findings(open_take(read_take(take)), FitSettings(), Monitor())
+    ] == [True]
     more(take, "[settings.tracking]\nno_such = 1\n")
     assert any("no_such" in f.sentence for f in check_take(take, Monitor()).findings)
     assert main.main(["check", str(take), "--quiet"]) == 1 and "no_such" in capsys.readouterr().out
