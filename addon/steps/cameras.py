@@ -58,9 +58,12 @@ def use_file(scene: bpy.types.Scene, path: Path) -> str:
     """
     rig = read_any(path)
     bar, names = read_bar(path, rig), names_for_views(rig, [view.name for view in scene.tricap.views])
+    before = [view.name for view in scene.tricap.views]
     use_rig(scene, renamed(rig, names), bar)
+    now = [view.name for view in scene.tricap.views]
+    moved = f" As they stand, from left to right: {', '.join(now)}." if now != before else ""
     matched = "".join(f" Camera {camera} is view {view}." for camera, view in names.items())
-    return f"{len(rig.cameras)} cameras from {path.name}.{matched}{' Correct the names if that is wrong.' if names else ''}"
+    return f"{len(rig.cameras)} cameras from {path.name}.{matched}{' Correct the names if that is wrong.' if names else ''}{moved}"
 
 
 def use_calibration_in(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> str:
