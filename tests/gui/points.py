@@ -1,4 +1,4 @@
-"""Single points: clicked in two views, followed, shown over the footage and in space; two of one view joined and followed there (2-D)."""
+"""Single points: clicked in two views, followed, shown over the footage and in space."""
 
 import importlib
 from pathlib import Path
@@ -32,7 +32,6 @@ def steps() -> drive.Steps:
     yield from clicked(places)
     yield from followed(take, places)
     yield from in_space()
-    yield from flat(take)
 
 
 def unfolded() -> None:
@@ -113,23 +112,3 @@ def in_space() -> drive.Steps:
         bpy.ops.view3d.view_axis(type="FRONT")
     drive.check("Velocities of Points" in bpy.data.objects, "the velocities are arrows in space")
     yield from drive.shot("4_in_space")
-
-
-def flat(take: Path) -> drive.Steps:
-    """Two points of one view, joined by a line and followed in its image."""
-    drive.window().workspace = bpy.data.workspaces[over_footage.CLICKS]
-    yield from drive.wait_for(lambda: len(over_footage.views()) == 3, 20, "the views are open again")
-    bpy.context.scene.frame_set(0)
-    area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
-    clip = area.spaces.active.clip
-    for track in clip.tracking.tracks:
-        track.select = track.name.startswith("point ")
-    yield from drive.press(area, "tricap.join_points")
-    drive.check(module("addon.points.tracks").joined(clip) == [("point 1", "point 2")], "the selected points are joined")
-    yield from drive.press(area, "tricap.follow_points2d")
-    planar = take / "results" / "planar"
-    yield from drive.wait_for(
-        lambda: any(planar.glob("*.csv")) and not bpy.context.window_manager.tricap.running, 60, "they are followed in the image"
-    )
-    drive.check("point 1 – point 2" in bpy.data.objects, "their line is in the scene")
-    yield from drive.shot("5_joined")
