@@ -10,7 +10,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.contour_skin import limb_skin
-from tricap.core.fitting.inputs import fit_input
+from tricap.core.fitting.inputs import background, fit_input
 from tricap.core.fitting.inputs.background import BackgroundRegions
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, JointPlaces, Packed
 from tricap.core.fitting.inputs.silhouettes import Silhouettes
@@ -88,6 +88,24 @@ def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly
     assert (seen.sigma_px[hands] == 12.0).all() and (seen.fraction[hands] == 0.5).all() and (seen.sigma_px[~hands] == 4.0).all()
     r = seen.residual(parameters.state(np.zeros(len(parameters.skeleton.dofs)), parameters.vector()))
     assert (0 < r[hands]).all() and (r[hands] < 0.6 * r.max()).all()  # hands and arms are 40 px outside, each
+
+
+def test_regions_of_many_frames_are_unpacked_within_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    parameters, n = ShapeParameters(default_shape(read_model("full"))), 6
+    images = [np.full((20, 30), 10 * t, np.uint8) for t in range(n)]
+    for t, image in enumerate(images):
+        image[:5, : t + 1] = 0
+        image[-1] = 1
+    empty = [BackgroundDistances(view="C", frame=np.arange(n), distance=Packed(images), step_px=4, unit_px=0.5)]
+    clouds = [SimpleNamespace(frame=t) for t in range(n)]
+    given = FitInput(rig=limb_scene.front_rig(), model="full", clouds=clouds, clicks={}, time_s=np.arange(n) / 30.0, background=empty)
+    monkeypatch.setattr(background, "CACHED_BYTES", 3 * images[0].nbytes)
+    regions = BackgroundRegions(given, parameters, FitSettings())
+    for t in [*range(n), 1, *range(n)]:
+        assert np.array_equal(regions.observe(t)[0].views[0].table, images[t])
+        assert len(regions.cells(t)[0].xy_px) == (images[t] == 0).sum()
+        assert len(regions._unpacked) <= 4 and set(regions._cells) <= set(regions._unpacked)
+    assert regions.cells(n - 1) is regions.cells(n - 1)
 
 
 def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene, other_person) -> None:

@@ -15,7 +15,7 @@ from tricap.core.fitting.explained import explained_area, limb_gains, misplaced
 from tricap.core.fitting.inputs.background import UNIT_PX
 from tricap.core.fitting.inputs.cloud_points import CloudPoints
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, Packed
-from tricap.core.fitting.limb import Limb, whole_limbs
+from tricap.core.fitting.limb import Limb, halton, whole_limbs
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Scales
 from tricap.core.fitting.solve.solver import Solution
@@ -213,3 +213,10 @@ def test_a_limb_that_explains_less_than_it_could_may_be_elsewhere(fit) -> None:
     assert right["wrist.R"] < 0.13  # 0.111 across the depth, which three outlines leave open
     assert left_behind["wrist.R"] > 1.5 * right["wrist.R"] and unseen["wrist.R"] > 1.5 * right["wrist.R"]
     assert right["pelvis"] == right["shoulder.R"] == 0.0 and right["elbow.R"] <= right["wrist.R"] + 0.01
+
+
+@pytest.mark.parametrize(("dimensions", "count"), [(1, 1), (3, 800), (60, 40)])
+def test_points_of_a_cube_are_those_of_halton(dimensions: int, count: int) -> None:
+    from scipy.stats import qmc
+
+    assert np.array_equal(halton(dimensions, count), qmc.Halton(dimensions, scramble=False).random(count))

@@ -252,6 +252,24 @@ def test_fields_are_released_after_their_derivatives_and_evaluated_again() -> No
     assert again._last and not points._last and np.array_equal(again.jacobian(state), J)
 
 
+def test_what_was_evaluated_at_a_state_is_not_used_at_another() -> None:
+    parameters = _parameters("full")
+
+    def cases():
+        rng = np.random.default_rng(7)
+        first, other = (parameters.state(_motion(parameters, rng), parameters.vector()) for _ in range(2))
+        return first, other, [c for c in _cases(parameters, first, rng) if isinstance(c, SilhouetteRays | BackgroundExclusion)]
+
+    first, other, used = cases()
+    fresh = cases()[2]
+    assert len(used) == 2
+    for one, anew in zip(used, fresh):
+        at_first = one.residual(first), one.jacobian(first)
+        assert not np.array_equal(at_first[0], one.residual(other))
+        assert np.array_equal(one.jacobian(other), anew.jacobian(other))
+        assert np.array_equal(one.jacobian(first), at_first[1]) and np.array_equal(one.residual(first), at_first[0])
+
+
 def test_the_derivative_test_notices_a_wrong_sign() -> None:
     rng = np.random.default_rng(0)
     parameters = _parameters("arm.R")
