@@ -57,7 +57,7 @@ def test_a_window_that_cannot_be_set_up_in_time_is_a_sentence(tmp_path: Path) ->
 
 
 def test_slow_tests_without_room_run_under_one_python(tmp_path: Path) -> None:
-    code, said = ci(tmp_path, slow="sleep 2", seconds=(8, 5, 3))
+    code, said = ci(tmp_path, slow="sleep 6", seconds=(31, 20, 11))
     assert code == 0 and said.count("dev.py test -m slow") == 1 and "the slow tests are left to the other Python" in said
 
 
