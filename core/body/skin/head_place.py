@@ -47,8 +47,8 @@ def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[Surface
     points, normals = _in_head(shape, b, frames, local[own > OWN])
     if len(points) < FEWEST:
         return skin
-    middle, vertices = local[own > OWN].mean(axis=0), vertex_normals(skin.vertices_m, skin.faces) @ R[b]
-    p = _registered(local[own > OWN], vertices[own > OWN], middle, points, normals)
+    middle, across = local[own > OWN].mean(axis=0), vertex_normals(skin.vertices_m, skin.faces) @ R[b]
+    p = _registered(local[own > OWN], across[own > OWN], middle, points, normals)
     share = Nearby(skin.vertices_m, skin.faces).mean(own[:, None])  # wider than the weights, or the throat would fold
     moved = local + share * (_moved(local, middle, p) - local)
     return replace(skin, vertices_m=head[b] + moved @ R[b].T)
@@ -70,9 +70,21 @@ def _in_head(shape: BodyShape, b: int, frames: Sequence[SurfacePoints], vertices
 
 def _moved(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) moved entirely."""
-    cosine, sine = np.cos(p[2]), np.sin(p[2])
-    turn = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
-    return np.asarray(((x - middle) * np.exp(p[3:])) @ turn.T + middle + [0.0, p[0], p[1]])
+    return np.asarray(((x - middle) * np.exp(p[3:])) @ _pitch(p[2]).T + middle + [0.0, p[0], p[1]])
+
+
+def _derivatives(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Those of `_moved` with respect to p, (V, 3, 6)."""
+    scaled, turn, shift = (x - middle) * np.exp(p[3:]), _pitch(p[2]), np.zeros((len(x), 3, 2))
+    shift[:, 1, 0] = shift[:, 2, 1] = 1.0
+    pitch = (scaled * [0.0, 1.0, 1.0]) @ _pitch(p[2] + np.pi / 2).T * [0.0, 1.0, 1.0]
+    return np.concatenate([shift, pitch[:, :, None], turn * scaled[:, None]], axis=2)
+
+
+def _pitch(angle: float) -> np.ndarray:
+    """Q (3, 3)."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
 def _registered(x: np.ndarray, across: np.ndarray, middle: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -89,8 +101,7 @@ def _registered(x: np.ndarray, across: np.ndarray, middle: np.ndarray, points: n
             return np.zeros(len(PRIOR))
         n, i = normals[good], near[good]
         r = np.einsum("nk,nk->n", n, points[good] - at[i])
-        steps = 1e-4 * np.eye(len(p))
-        J = np.stack([np.einsum("nk,nk->n", n, _moved(x[i], middle, p + h) - at[i]) for h in steps], axis=1) / 1e-4
+        J = np.einsum("nk,nkp->np", n, _derivatives(x[i], middle, p))
         spread = max(SIGMA_M, 1.4826 * float(np.median(np.abs(r))))
         weight = np.clip(1 - (r / (TUKEY * spread)) ** 2, 0, None) ** 2 / (EACH_FOR * spread**2)
         normal = J.T @ (weight[:, None] * J) + np.diag(PRIOR**-2)

@@ -195,7 +195,7 @@ def _without_velocity(given: PoseTracking, motion: np.ndarray, last: int, points
     """The pose of frame `last`, and the same moved as the middle of the body's points."""
     own, moved = _near(given, last, given.state(motion[last])).xyz_m, motion[last].copy()
     if not len(own) or not len(points.xyz_m):
-        return [moved]
+        return [motion[last]]
     moved[given.fit.model.skeleton.layout.group("base")] += np.median(points.xyz_m, axis=0) - np.median(own, axis=0)
     return [motion[last], moved]
 
