@@ -1,12 +1,14 @@
 """How much of what is seen in a frame a pose explains: measured points, and the person's cells in front of the still background.
 
     w(g) = 1 / (1 + (g / width)²)²                                                                        (1)
-    gain = Σ_i a_i max(0, max_b w(g_ib) − taken_i) − Σ_s a_s (min(1, d_s / r_s) + through_s)               (2)
+    e = Σ_i a_i max(0, max_b w(g_ib) − taken_i)                                                           (2)
+    gain = e_points + max(0, e_cells − UNSEEN · A) − Σ_s a_s (min(1, d_s / r_s) + through_s)               (3)
 
 i are points and cells, b the bones of a limb as tapered capsules, g the distance from a capsule's surface (cells: beyond its image), and
-`taken` what the rest of the body explains. s are places along the limb: d_s is how far a place lies in the background, averaged over the
-views, r_s the limb's radius there; `through` is 1 where points were measured far behind it, or where it lies inside another part. Areas a
-are in voxels of the cloud, so that (2) counts like points. Many poses of one limb are evaluated at once.
+`taken` what the rest of the body explains. A is the limb's own area: the body's outline differs from the model's all around, and a hidden
+limb must not be drawn to these rims. s are places along the limb: d_s is how far a place lies in the background, averaged over the views,
+r_s the limb's radius there; `through` is 1 where points were measured far behind it, or where it lies inside another part. Areas a are in
+voxels of the cloud, so that (3) counts like points. Many poses of one limb are evaluated at once.
 """
 
 from collections.abc import Sequence
@@ -27,6 +29,7 @@ from .state import BodyState, ShapeParameters, free_bones
 MOST_POINTS, MOST_NEAR = 1000, 400  # of a frame, and near a limb
 COARSE = 3  # points and cells as one, for a first choice among many poses
 CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of measured points
+UNSEEN = 0.2  # of a limb's area: rims of the rest of the body are no larger
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
 BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
 LARGEST, SHARED_FROM = 256, 64  # poses evaluated at once, and from which on threads share them
@@ -141,19 +144,19 @@ class Evidence:
 
 
 def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
-    """(2) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
+    """(3) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
     state = limb.parameters.state(poses[0], vector)
     others = _others(limb, state)
 
     def gains(rows: slice) -> np.ndarray:
         capsules = _limb_capsules(evidence, limb, poses[rows], state)
-        return _explained_by(evidence, capsules, state, width_m) - _misplaced(evidence, capsules, state, others)
+        return _explained_by(evidence, capsules, state, width_m, UNSEEN) - _misplaced(evidence, capsules, state, others)
 
     return np.concatenate(in_threads(gains, equal_pieces(len(poses), LARGEST, SHARED_FROM)))
 
 
 def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
-    """(2) of a whole body with the shape vector (S,) in N poses (N, D)."""
+    """(3) of a whole body with the shape vector (S,) in N poses (N, D), where all cells count."""
     state = parameters.state(poses[0], vector)
     R, head = bone_frames(parameters.skeleton, state.lengths_m, poses)
     bones = np.array(sorted(state.profiles))
@@ -162,7 +165,7 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
 
 
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
-    """The area of a body's limb that contradicts what is seen: the second sum of (2)."""
+    """The area of a body's limb that contradicts what is seen: the last sum of (3)."""
     return float(_misplaced(evidence, _limb_capsules(evidence, limb, state.motion[None], state), state, _others(limb, state))[0])
 
 
@@ -222,12 +225,14 @@ def _others(limb: Limb, state: BodyState) -> np.ndarray:
     return np.array([b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer], dtype=np.intp)
 
 
-def _explained_by(evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float) -> np.ndarray:
-    """The first sum of (2) for capsules in N poses (N,); a cell's area is that at the first of them in one `state`."""
-    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
+def _explained_by(evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float, unseen: float = 0.0) -> np.ndarray:
+    """The first terms of (3) in N poses (N,), with a share `unseen`; a cell's area is that at the first capsule in one `state`."""
+    cells = np.zeros(len(capsules.first_m))
     for view, share in zip(evidence.cells, evidence.taken_cells):
-        gain += evidence.cell_area(view, state.head_m[capsules.bones[0]]) * _gain_of_cells(view, capsules, share, width_m)
-    return gain
+        cells += evidence.cell_area(view, state.head_m[capsules.bones[0]]) * _gain_of_cells(view, capsules, share, width_m)
+    own = 2 * float((capsules.radii_m.mean(axis=1) * capsules.length_m).sum()) / evidence.voxel_m**2
+    points = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
+    return np.asarray(points + np.maximum(cells - unseen * CELL_WEIGHT * own, 0.0))
 
 
 def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from ..explained import Evidence, limb_gains
 from ..inputs.cloud_points import CloudPoints
 from ..limb import Limb
 from ..solve.problem import Estimate
-from .limb_paths import ACCELERATION_M_S2, COARSE_M, FINE_M, GAIN, SIGMA_M
+from .limb_paths import COARSE_M, FINE_M, GAIN, unlikely
 
 ANYWHERE, ANYWHERE_RAD = 300, np.pi  # poses all over the joints' range
 AROUND, AROUND_RAD = 60, float(np.radians(40.0))  # poses around the fitted one
@@ -123,6 +123,4 @@ def of_joints(limbs: Sequence[Elsewhere], skeleton: Skeleton, frames: int) -> np
 
 def _jump(a: LimbModes, b: LimbModes, step_s: float) -> np.ndarray:
     """m (K, L) between the poses of two frames."""
-    sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
-    away = ((b.ends_m[None] - a.ends_m[:, None]) ** 2).sum(axis=(2, 3)) / (2 * sigma**2)
-    return np.minimum(away, LARGEST_JUMP)
+    return np.minimum(unlikely(b.ends_m[None] - a.ends_m[:, None], step_s), LARGEST_JUMP)

@@ -6,7 +6,7 @@ k are poses of the limb in frame t: those of the ways so far, kept and continued
 (Halton 1960), improved where they explain most (`explained.limb_gains`). X are the ends of the limb's bones, X̂_j those predicted from way
 j with damped velocity, σ grows with the time between the frames. The best `WAYS` poses that differ go on (beam search; Viterbi 1967). The
 trunk stays as it was tracked: it is large and hardly ever lost. What is visible of a limb later thus decides where it went before. Where
-the best way differs from the tracked poses, it replaces them only if it explains more (`LEAST_BETTER`). A limb is followed from the frame
+the best way differs from the tracked poses, it replaces them only if its cost is lower by `LEAST_BETTER`. A limb is followed from the frame
 where the fit begins, and stays there as it was found; one that is not certain there (`FitContext.unsure`) is followed from the first frame
 to the last, and may begin anywhere.
 """
@@ -34,7 +34,7 @@ LARGEST_JUMP = 14.0
 VELOCITY_KEPT = 0.8
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights
 REPLACED_M = 0.05  # a tracked pose whose limb ends are nearer to the way stays
-LEAST_BETTER = 15.0  # voxels a frame by which a way must explain more than the tracked poses that it replaces
+LEAST_BETTER = 1.5  # a frame, by which the cost of a way must be lower than that of the tracked poses that it replaces
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,19 +69,43 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
 
 
 def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: list[tuple[int, np.ndarray, np.ndarray]]) -> dict[int, np.ndarray]:
-    """The limb's angles (C,) by frame, where its way differs from a motion (T, D) and explains more, stretch after stretch.
+    """The limb's angles (C,) by frame, where its way differs from a motion (T, D) and costs less, stretch after stretch.
 
     Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it.
     """
-    angles, vector = {t: a for t, a, _ in way}, given.first.vector
-    apart = [t for t, _, ends in way if np.linalg.norm(ends - limb.ends(motion[t][None], vector)[0], axis=1).max() > REPLACED_M]
+    angles, tracked = {t: a for t, a, _ in way}, limb.ends(motion, given.first.vector)
+    by_way = tracked.copy()
+    for t, _, ends in way:
+        by_way[t] = ends
+    apart = [t for t in angles if np.linalg.norm(by_way[t] - tracked[t], axis=1).max() > REPLACED_M]
     found = dict[int, np.ndarray]()
     frames = np.array(sorted(apart), dtype=np.intp)
     for stretch in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
-        gain = [_gain_by_way(given, int(t), motion[t], limb, angles[int(t)]) for t in stretch]
-        if gain and float(np.mean(gain)) > LEAST_BETTER:
+        if not len(stretch):
+            continue
+        gain = sum(_gain_by_way(given, int(t), motion[t], limb, angles[int(t)]) for t in stretch)
+        around = np.arange(max(stretch[0] - 2, 0), min(stretch[-1] + 3, len(motion)))
+        replaced = np.where(np.isin(around, stretch)[:, None, None], by_way[around], tracked[around])
+        smoother = _unevenness(tracked[around], given.time_s[around]) - _unevenness(replaced, given.time_s[around])
+        if gain / GAIN + smoother > LEAST_BETTER * len(stretch):
             found.update({int(t): angles[int(t)] for t in stretch})
     return found
+
+
+def _unevenness(ends_m: np.ndarray, time_s: np.ndarray) -> float:
+    """What (1) costs a limb whose ends (T, E, 3) move in this way, apart from what it explains."""
+    cost, velocity = 0.0, np.zeros_like(ends_m[0])
+    for before, now, step_s in zip(ends_m, ends_m[1:], np.diff(time_s)):
+        away = float(unlikely(now - before - VELOCITY_KEPT * step_s * velocity, float(step_s)))
+        cost += min(away, LARGEST_JUMP)
+        velocity = (now - before) / step_s if away <= LARGEST_JUMP else np.zeros_like(now)
+    return cost
+
+
+def unlikely(apart_m: np.ndarray, step_s: float) -> np.ndarray:
+    """|X − X̂|² / 2σ² of (1) (...,) for differences (..., E, 3) after a time."""
+    sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
+    return np.asarray((apart_m**2).sum(axis=(-2, -1)) / (2 * sigma**2))
 
 
 def _gain_by_way(given: PoseTracking, t: int, pose: np.ndarray, limb: Limb, angles: np.ndarray) -> float:
@@ -143,8 +167,7 @@ def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, ne
     gain, ends = limb_gains(near, limb, poses, vector, FINE_M), limb.ends(poses, vector)
     anew = step_s == 0  # the first frame of an unsure limb: any pose is as probable before it is seen
     expected = ways.ends_m + VELOCITY_KEPT * step_s * ways.velocity_m_s
-    sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
-    away = ((ends[:, None] - expected[None]) ** 2).sum(axis=(2, 3)) / (2 * sigma**2)
+    away = unlikely(ends[:, None] - expected[None], step_s)
     total = ways.cost[None] + np.minimum(away, LARGEST_JUMP) * (not anew)
     before = np.argmin(total, axis=1)
     cost = total[np.arange(len(tried)), before] - gain / GAIN

@@ -22,7 +22,7 @@ from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.contradicted import ANYWHERE_M, CONTRADICTED, widened
 from tricap.core.fitting.stages.hidden_limbs import reacquired_poses
 from tricap.core.fitting.stages.limb_modes import elsewhere, of_joints
-from tricap.core.fitting.stages.limb_paths import _begin, _courses, follow_limbs
+from tricap.core.fitting.stages.limb_paths import LARGEST_JUMP, _begin, _courses, _unevenness, follow_limbs
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.state import free_bones
@@ -100,11 +100,31 @@ def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     evidence, state = fit.seen(4, NOTHING), fit.parameters.state(POSES[4], vector)
     near = evidence.near(limb, state)
     gains = limb_gains(near, limb, np.array([_raised(degrees) for degrees in (0.0, 20.0, 40.0, 60.0)]), vector, 0.02)
-    assert np.argmax(gains) == 2 and gains[2] > 0.6 * near.unexplained(limb.head_m(POSES[4], vector)) > 100
+    assert np.argmax(gains) == 2 and gains[2] > 0.4 * near.unexplained(limb.head_m(POSES[4], vector)) > 100
     assert gains[0] < 0 and gains[3] < 0  # in the background
     assert misplaced(evidence, limb, state) < 1.0
     assert misplaced(evidence, limb, fit.parameters.state(_raised(60.0), vector)) > CONTRADICTED
     assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
+
+
+def test_rims_of_the_rest_of_the_body_are_no_limb(fit) -> None:
+    """Cells of which the body explains all but a little are not the arm's, wherever it lies; all of them together would be."""
+    limb, vector, pose = _arm(fit), _vector(fit), POSES[4:5]
+    near = fit.seen(4, NOTHING).near(limb, fit.parameters.state(pose[0], vector))
+    rims = replace(near, taken_cells=[np.full(len(view.xy_px), 0.85) for view in near.cells])
+    state = fit.parameters.state(pose[0], vector)
+    assert limb_gains(rims, limb, pose, vector, 0.02)[0] == -misplaced(rims, limb, state)
+    half = replace(near, taken_cells=[np.full(len(view.xy_px), 0.5) for view in near.cells])
+    assert limb_gains(half, limb, pose, vector, 0.02)[0] > 20
+
+
+def test_a_limb_that_leaps_and_returns_costs_more_than_one_that_swings() -> None:
+    time_s, swing = np.arange(6) / 30, np.zeros((6, 2, 3))
+    swing[:, 1, 0] = 0.02 * np.arange(6)
+    leap = swing.copy()
+    leap[3] += 0.5
+    assert _unevenness(swing, time_s) < 1.0
+    assert _unevenness(leap, time_s) == pytest.approx(2 * LARGEST_JUMP, abs=1.0)  # there and back
 
 
 def test_a_limb_that_ends_beside_a_camera_is_not_seen_there(fit) -> None:
