@@ -109,6 +109,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_not_read("--out", args.blend, args.rig)
     if args.report:
         check_not_read("--report would overwrite an input:", args.blend.with_suffix(".json"), args.map)
+        _check_replaceable_report(args.blend)
     table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
@@ -133,6 +134,13 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
         return [json.dumps(table, indent=1, ensure_ascii=False)]
     return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in outcome.notes)]
+
+
+def _check_replaceable_report(blend: Path) -> None:
+    """A report next to no such .blend file is not of an earlier retargeting."""
+    for file in (blend.with_suffix(".json"), blend.with_suffix(".png")):
+        if file.exists() and not blend.exists():
+            raise InputError(f"--report would overwrite {file}, which is not of an earlier {blend.name}; choose another name for --out.")
 
 
 def outcome_table(outcome: Any, source_map: Any, target_map: Any) -> dict[str, Any]:

@@ -343,8 +343,13 @@ def test_the_command_with_a_run_a_map_and_a_report(empty: ModuleType, small_run:
 def test_a_run_of_one_frame_moves_the_clavicle(empty: ModuleType, full_run: Path, tmp_path: Path) -> None:
     armature(person(arms_down_deg=45.0), "Target")
     empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
-    out = tmp_path / "out.blend"
-    assert main(["retarget", str(full_run), "--rig", str(tmp_path / "rig.blend"), "--out", str(out), "--report", "--quiet"]) == 0
+    out, stranger = tmp_path / "out.blend", tmp_path / "out.png"
+    command = ["retarget", str(full_run), "--rig", str(tmp_path / "rig.blend"), "--out", str(out), "--report", "--quiet"]
+    stranger.write_bytes(b"holiday")
+    assert main(command) == 2 and stranger.read_bytes() == b"holiday" and not out.exists()
+    stranger.unlink()
+    assert main(command) == 0
+    assert main(command) == 0  # its own report is replaced
     empty.ops.wm.open_mainfile(filepath=str(out))
     target = empty.data.objects["Target"]
     assert abs(np.degrees(angle_of(np.array(target.pose.bones["clavicle.R"].matrix_basis)[:3, :3])) - 30.0) < PLAYED_DEG

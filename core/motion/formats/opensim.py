@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
+from ...foundation.errors import InputError
 from ...geometry.rotation import euler_from_matrix, transposed
 from ...images.interlace import frame_time_s
 from ..retarget.rig import Motion, Rig, head_of
@@ -23,6 +24,8 @@ from .markers import AXES
 TURNS = ("rz", "rx", "ry")  # the first one turns about the axis of the parent
 AXIS = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 MOVES = 5e-5  # metres: a head that moves less relative to its parent is rigidly attached
+CREDITS = "Written by Tricap for kinematics: lengths are measured, masses are not."
+MODEL_BYTES = 1 << 26  # of an earlier export
 MASS_KG, INERTIA = "1", "0.01 0.01 0.01 0 0 0"
 
 
@@ -32,8 +35,9 @@ def write_opensim(path: Path, motion: Motion, *, names: dict[str, str] | None = 
     `names`: other names by those of the bones. Angles are written in degrees, translations in metres.
 
     Raises:
-        InputError: a file cannot be written.
+        InputError: a file cannot be written, or the model's would replace one that is not of an earlier export.
     """
+    _check_replaceable(Path(path).with_suffix(".osim"))
     A, rig = AXES["OpenSim"], motion.rig
     bodies = component_names([(names or {}).get(name, name) for name in rig.names])
     since_rest = motion.R @ transposed(rig.R_rest)  # (1)
@@ -51,6 +55,15 @@ def write_opensim(path: Path, motion: Motion, *, names: dict[str, str] | None = 
     path = Path(path)
     store.write_bytes(path.with_suffix(".osim"), _model(path.stem, rig, bodies, moving, A))
     store.write_text(path, _storage(path.stem, columns))
+
+
+def _check_replaceable(model: Path) -> None:
+    try:
+        ours = not model.exists() or CREDITS.encode() in bounded.bytes_of(model, MODEL_BYTES)
+    except OSError:
+        ours = False
+    if not ours:
+        raise InputError(f"{model} exists and is not of an earlier export; choose another name, so that it is not overwritten.")
 
 
 def component_names(names: list[str]) -> list[str]:
@@ -85,7 +98,7 @@ def _model(name: str, rig: Rig, bodies: list[str], moving: set[int], A: np.ndarr
     """The model as a document of OpenSim 4."""
     document = ElementTree.Element("OpenSimDocument", Version="40000")
     model = ElementTree.SubElement(document, "Model", name=name)
-    _add(model, credits="Written by Tricap for kinematics: lengths are measured, masses are not.", gravity="0 -9.80665 0")
+    _add(model, credits=CREDITS, gravity="0 -9.80665 0")
     _add(model, length_units="meters", force_units="N")
     in_bodies, in_joints = (ElementTree.SubElement(ElementTree.SubElement(model, kind), "objects") for kind in ("BodySet", "JointSet"))
     for b, body in enumerate(bodies):

@@ -63,6 +63,17 @@ def test_opensim_plays_the_motion(tmp_path: Path, loose: bool) -> None:
     assert np.abs(origin - motion.head_m @ A.T).max() < PLACE_M
 
 
+def test_a_model_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
+    motion, model = flail(person()), tmp_path / "kick.osim"
+    model.write_text("<OpenSimDocument/>")
+    with pytest.raises(InputError, match="not of an earlier export"):
+        write_opensim(tmp_path / "kick.mot", motion)
+    assert model.read_text() == "<OpenSimDocument/>" and not (tmp_path / "kick.mot").exists()
+    model.unlink()
+    for _ in range(2):  # its own model is replaced
+        write_opensim(tmp_path / "kick.mot", motion)
+
+
 def test_names_of_components_are_plain_and_different() -> None:
     assert component_names(["hand.L", "hand_L", "Main gauche é", "", "ground"]) == [
         "hand_L",
