@@ -28,6 +28,7 @@ from .quality import Quality, assess
 from .report import pictures
 from .self_calibration import Calibration
 from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
+from .together import BarAndBoard, calibrate_together
 from .world_frame import WorldChoice, frame_of_bar
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with both targets
@@ -133,16 +134,16 @@ def _common(sequences: tuple[ImageSequence, ...], firsts: tuple[int, ...]) -> tu
     return tuple(LaterPart(s, first, count) for s, first in zip(sequences, firsts))
 
 
-def open_boards(folder: Path, firsts: Firsts | None = None) -> BoardFootage:
+def open_boards(folder: Path, firsts: Firsts | None = None, together: bool = True) -> BoardFootage:
     """Open the sequences of a board in BOARDDIR: one folder of images, or one movie, per camera; images of the same number belong together,
-    or those that `firsts` finds.
+    or those that `firsts` finds, if they were taken `together`.
 
     Raises:
-        InputError: the folder is missing, has fewer than two views, or movies of different length.
+        InputError: the folder is missing, has fewer than two views, or movies of different length that were taken together.
     """
     names, sequences = open_views(Path(folder), "board", gaps=True)
-    sequences = sequences if firsts is None else _common(sequences, firsts(names, sequences))
-    return numbered(Path(folder), names, sequences)
+    sequences = sequences if firsts is None or not together else _common(sequences, firsts(names, sequences))
+    return numbered(Path(folder), names, sequences, together)
 
 
 def _masks(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray | None, ...]:
@@ -266,20 +267,22 @@ class CalibratedRig:
 
 
 def calibrate_rig(
-    observations: BarObservations | BoardObservations,
+    observations: BarObservations | BoardObservations | BarAndBoard,
     monitor: Monitor,
     *,
     focal_px: float | None = None,
     lens: Lens = Lens.AUTO,
     world: WorldChoice | None = None,
 ) -> CalibratedRig:
-    """Calibrate from the observations of the bar or the board, judge the result, and put it into the world's frame.
+    """Calibrate from the observations of the bar, the board or both, judge the result, and put it into the world's frame.
 
     Raises:
         InputError: the data do not determine the rig or the world's frame; the message names what is missing.
     """
     world = world or WorldChoice()
-    if isinstance(observations, BarObservations):
+    if isinstance(observations, BarAndBoard):
+        calibration = calibrate_together(observations, monitor, focal_px, lens)
+    elif isinstance(observations, BarObservations):
         calibration = calibrate_bar(observations, monitor, focal_px, lens)
     else:
         calibration = calibrate_boards(observations, monitor, focal_px, lens)
@@ -291,7 +294,7 @@ def calibrate_rig(
     metadata = {
         "unit": "m",
         "sigma0_px": calibration.sigma0_px,
-        **observations.described,
+        **calibration.described,
         "positions": verdict.positions_used(calibration),
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
@@ -299,7 +302,7 @@ def calibrate_rig(
         **({} if judged.light is verdict.Light.GREEN else {"light": judged.light.value}),
         "floor": world.on_floor,
     }
-    cameras = calibration.network.cameras(observations.names, observations.size_px)
+    cameras = calibration.network.cameras(calibration.observations.names, calibration.observations.size_px)
     rig = Rig(cameras=cameras, metadata=metadata, sigmas=report.camera_sigmas(calibration))
     return CalibratedRig(rig=rig, calibration=calibration, quality=quality, verdict=judged)
 
@@ -315,7 +318,11 @@ def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     known = observations.measured(calibration.used)
     frame = frame_of_bar(world, cameras, observations.frames[known], network.points_m[known])
     moved = network.transformed(frame.R, frame.shift_m)
-    return replace(calibration, network=moved.with_cameras([frame.camera(c) for c in cameras]))
+    moved = moved.with_cameras([frame.camera(c) for c in cameras])
+    if calibration.other is None:
+        return replace(calibration, network=moved)
+    other = calibration.other.moved(frame)
+    return replace(calibration, network=moved, other=other, unknowns=replace(calibration.unknowns, block=other.block))
 
 
 def write_report(folder: Path, result: CalibratedRig) -> list[Path]:

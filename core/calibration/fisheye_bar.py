@@ -8,19 +8,21 @@ The search for cameras without such lenses (`reference_bar`) finds the poses fro
 the original points, and the guess with the smallest robust sum of squares wins.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..foundation.errors import InputError
 from .bars import BarObservations, labelled_ends, with_bars
-from .bundle import Adjusted, LevenbergMarquardt, adjust
+from .bundle import Adjusted, Block, LevenbergMarquardt, adjust
 from .network import BarNetwork
 from .reference_bar import COARSE_CAUCHY_PX, GATE, ROUGH_FOCALS, WIDE_GATE, initial_network, lens_prior
 
 FOCAL_PARTS = np.geomspace(0.22, 0.8, 7)  # focal lengths in widths
 NARROW = np.radians(65)  # from the axis: points further out are not used for the start
 POSITIONS = 120
+WIDE = 4  # times WIDE_GATE, the first tolerance
 
 
 def fisheye_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted[BarNetwork]:
@@ -62,9 +64,16 @@ def _trial(observations: BarObservations, flat: BarNetwork, focal_px: float) -> 
     interior = np.zeros_like(flat.interior)
     interior[:, 0], interior[:, 1:3] = focal_px, (observations.size_px - 1) / 2
     network = replace(flat, interior=interior, fisheye=np.ones(len(interior), dtype=bool))
+    return adjusted_start(network, observations, ("f", "k1"), (WIDE * WIDE_GATE, WIDE_GATE, GATE))
+
+
+def adjusted_start(
+    network: BarNetwork, observations: BarObservations, names: Sequence[str], gates: Sequence[float], block: Block | None = None
+) -> Adjusted[BarNetwork]:
+    """A short robust adjustment on a part of the positions, with these unknowns of the lenses, and tolerances that become narrower."""
     some = observations.part(np.unique(np.linspace(0, len(observations.xy_px) - 1, POSITIONS).astype(int)))
-    prior = lens_prior(some.size_px, interior[:, 0], network.fisheye).only("f", "k1")
-    for gate in (4 * WIDE_GATE, WIDE_GATE, GATE):
+    prior = replace(lens_prior(some.size_px, network.interior[:, 0], network.fisheye).only(*names), block=block)
+    for gate in gates:
         tolerance = gate * COARSE_CAUCHY_PX
         part = some if some.labelled else labelled_ends(network, some, tolerance)
         network, used = with_bars(network, part, tolerance)

@@ -158,6 +158,10 @@ def _calibrate(commands: Any) -> None:
     parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the rig to write, such as rig.toml")
     parser.add_argument("--board", choices=BOARDS, help="the images show a board instead of a bar")
+    about = "with --bar-length: a folder like BARDIR of the board, filmed by the same cameras; both go into one adjustment"
+    parser.add_argument("--with-board", type=Path, metavar="DIR", help=about)
+    about = "with --with-board: the cameras were moved between the films, or filmed the board one after another; it gives their lenses only"
+    parser.add_argument("--lenses-only", action="store_true", help=about)
     parser.add_argument("--squares", metavar="9x6", help="across and down: inner corners of a chessboard, squares of a ChArUco board")
     parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
     parser.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")

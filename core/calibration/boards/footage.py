@@ -34,12 +34,14 @@ class BoardFootage:
     numbers: tuple[np.ndarray, ...]  # (count,) of each
 
 
-def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> BoardFootage:
+def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...], together: bool = True) -> BoardFootage:
     """Images with their numbers: those in the names of the files, or their order where the names have none.
 
     Raises:
-        InputError: movies have different lengths, or no image belongs to another one.
+        InputError: movies that were taken `together` have different lengths.
     """
+    if not together:
+        return BoardFootage(folder=folder, names=names, sequences=sequences, numbers=tuple(np.arange(s.count) for s in sequences))
     numbers = [_numbers(s) for s in sequences]
     if any(n is None for n in numbers):
         counts = {name: s.count for name, s in zip(names, sequences)}
