@@ -28,7 +28,7 @@ from .cameras import build_cameras, rig_of_scene
 if TYPE_CHECKING:
     from ...core.calibration.bars import BarObservations
     from ...core.calibration.boards.footage import BoardFootage
-    from ...core.calibration.calibrate import BarFootage, CalibratedRig, Firsts, MeasuredBar
+    from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar, Starts
     from ...core.calibration.together import BarAndBoard
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -81,7 +81,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         """Folder, target and options as they are now."""
         from ...core.calibration import calibrate
         from ...core.calibration.boards.footage import measure_boards
-        from ...core.synchronising.bar_and_board import first_images
+        from ...core.synchronising.bar_and_board import common_start
         from ..movie_sound import movie_sound
 
         props = context.scene.tricap_calibrate
@@ -96,17 +96,19 @@ class Calibrate(JobOperator, bpy.types.Operator):
         focal, lens = props.focal_px if props.focal_px > 0 else None, Lens(props.lens)
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
-        target, fps = props.target, props.started_fps
+        target, rates, by_sound = props.target, props.rates.strip() or f"{props.started_fps:g}", props.started_fps > 0
         beside = _board_beside(props) if target == "WAND" and props.board_footage else None
         board = None if target == "WAND" else board_of(props, target)
         get_session().file.bar_counts.clear()
 
-        def firsts_at(there: Path, monitor: Monitor) -> "Firsts | None":
-            return None if fps <= 0 else lambda names, views: first_images(there, names, views, fps, monitor, movie_sound)[0]
+        def starts(there: Path, monitor: Monitor) -> "Starts | None":
+            if not by_sound and "=" not in rates:
+                return None
+            return lambda names, views: common_start(there, names, views, rates, monitor, movie_sound, by_sound)[0]
 
         def from_wand(monitor: Monitor) -> Done:
-            footage = calibrate.open_bar(folder, interlaced, mask, first_field, firsts_at(folder, monitor))
-            shown = beside and beside.opened(footage.names, firsts_at(beside.folder, monitor))
+            footage = calibrate.open_bar(folder, interlaced, mask, first_field, starts(folder, monitor))
+            shown = beside and beside.opened(footage.names, starts(beside.folder, monitor))
             measured = calibrate.measure_bar(footage, length, monitor, partial(note_count, target), diameter or None)
             observations = measured.observations if not (beside and shown) else beside.measured(measured.observations, shown, monitor)
             result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
@@ -114,7 +116,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
 
         def from_board(monitor: Monitor) -> Done:
             assert board is not None
-            footage = calibrate.open_boards(folder, firsts_at(folder, monitor))
+            footage = calibrate.open_boards(folder, starts(folder, monitor))
             observations = measure_boards(footage, board, monitor, partial(note_count, target))
             result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
             write(result, out)
@@ -149,7 +151,7 @@ class BoardBeside:
     board: Board
     lenses_only: bool
 
-    def opened(self, names: tuple[str, ...], firsts: "Firsts | None") -> "BoardFootage":
+    def opened(self, names: tuple[str, ...], starts: "Starts | None") -> "BoardFootage":
         """Its footage.
 
         Raises:
@@ -158,7 +160,7 @@ class BoardBeside:
         from ...core.calibration.calibrate import open_boards
         from ...core.calibration.together import check_names
 
-        footage = open_boards(self.folder, firsts, together=not self.lenses_only)
+        footage = open_boards(self.folder, starts, together=not self.lenses_only)
         check_names(names, footage.names)
         return footage
 

@@ -17,6 +17,7 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.prop(props, "bar")
     (_wand if props.target == "WAND" else _board)(layout, props)
     layout.prop(props, "started_fps")
+    layout.prop(props, "rates", placeholder="only if they differ: L=24, C=30")
     layout.prop(props, "focal_px")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")

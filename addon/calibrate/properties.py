@@ -93,6 +93,10 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         description="Images per second of cameras that were started one by one: when each of them began is found by its sound, by light or "
         "by time codes. 0: all films begin at the same instant",
     )
+    rates: bpy.props.StringProperty(
+        name="FPS of Views",
+        description="Images per second of each camera where they differ, such as L=24, C=30, R=60. Empty: the same for all",
+    )
     interlaced: bpy.props.EnumProperty(
         name="Interlacing",
         default="none",  # type: ignore[valid-type]

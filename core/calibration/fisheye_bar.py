@@ -16,6 +16,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .bars import BarObservations, labelled_ends, with_bars
 from .bundle import Adjusted, Block, LevenbergMarquardt, adjust
+from .delays import first_delays, misfit, moving_points
 from .network import BarNetwork
 from .reference_bar import COARSE_CAUCHY_PX, GATE, ROUGH_FOCALS, WIDE_GATE, initial_network, lens_prior
 
@@ -31,10 +32,9 @@ def fisheye_network(observations: BarObservations, focal_px: float | None = None
     Raises:
         InputError: the cameras share too few bars.
     """
-    grid = focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_PARTS * float(np.median(observations.size_px[:, 0]))
     best: Adjusted[BarNetwork] | None = None
     problem: InputError | None = None
-    for f in grid:
+    for f in _focal_lengths(observations, focal_px):
         try:
             flat = initial_network(_flat(observations, float(f)), float(f))
         except InputError as error:
@@ -47,6 +47,18 @@ def fisheye_network(observations: BarObservations, focal_px: float | None = None
         assert problem is not None
         raise problem
     return best
+
+
+def fisheye_delays(observations: BarObservations, focal_px: float | None = None) -> np.ndarray:
+    """How late each camera is (C,): of the delays found with each guess of the focal length, those at which a guess fits best."""
+    size, labelled = observations.size_px, observations.labelled
+    moving = [moving_points(observations.frames, _flat(observations, float(f)).xy_px) for f in _focal_lengths(observations, focal_px)]
+    found = np.unique([first_delays(guess, size, labelled) for guess in moving], axis=0)
+    return min(found, key=lambda late: min(misfit(guess, size, late, labelled) for guess in moving))
+
+
+def _focal_lengths(observations: BarObservations, focal_px: float | None) -> np.ndarray:
+    return focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_PARTS * float(np.median(observations.size_px[:, 0]))
 
 
 def _flat(observations: BarObservations, focal_px: float) -> BarObservations:

@@ -37,7 +37,7 @@ from .bundle import (
     residuals_of,
 )
 from .delays import MovingPoints, first_delays, in_order, moving_points, without_jumps
-from .fisheye_bar import fisheye_network
+from .fisheye_bar import fisheye_delays, fisheye_network
 from .helmert import Partial
 from .network import BarNetwork, Network, Observations
 from .precision import camera_covariance, group_of, with_left_out
@@ -110,6 +110,7 @@ class Calibration:
 
 
 Start = Callable[[BarObservations], BarNetwork]  # the cameras, from nothing
+Delays = Callable[[BarObservations], np.ndarray]  # (C,) how late each camera is, roughly
 
 
 def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None, fisheye: bool = False) -> Calibration:
@@ -118,26 +119,30 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     Raises:
         InputError: the cameras share too few bars.
     """
-    search = fisheye_network if fisheye else initial_network
-    return calibrate_from(lambda some: search(some, focal_px).network, observations, monitor, None if fisheye else observations)
+    if fisheye:
+        return calibrate_from(
+            lambda some: fisheye_network(some, focal_px).network, observations, monitor, lambda raw: fisheye_delays(raw, focal_px)
+        )
+    return calibrate_from(lambda some: initial_network(some, focal_px).network, observations, monitor, delays_of_bars)
+
+
+def delays_of_bars(bars: BarObservations) -> np.ndarray:
+    """How late each camera is (C,), if its lens keeps lines nearly straight."""
+    return first_delays(moving_points(bars.frames, bars.xy_px), bars.size_px, bars.labelled)
 
 
 def calibrate_from(
-    start: Start, observations: BarObservations, monitor: Monitor, straight: BarObservations | None, other: Partial | None = None
+    start: Start, observations: BarObservations, monitor: Monitor, delays: Delays, other: Partial | None = None
 ) -> Calibration:
-    """Calibrate the cameras from the network that `start` finds, together with another object if there is one.
-
-    `straight` are the observations as those of lenses that keep lines nearly straight, by which the first delays are found.
+    """Calibrate the cameras from the network that `start` finds and the first `delays`, together with another object if there is one.
 
     Raises:
         InputError: the cameras share too few bars.
     """
     monitor.step("calibration", 0, 5)
     raw = without_jumps(observations.frames, observations.xy_px)
-    late = none = np.zeros(len(observations.names))
-    if straight is not None:
-        moving = moving_points(observations.frames, np.where(np.isfinite(raw), straight.xy_px, np.nan))
-        late = first_delays(moving, observations.size_px, observations.labelled)
+    none = np.zeros(len(observations.names))
+    late = delays(observations.changed(raw, labelled=observations.labelled))
     done = _at_delays(start, observations, raw, late, monitor, other) if late.any() else None
     if done is None or not _convincing(done):
         at_once = _at_delays(start, observations, raw, none, monitor, other)

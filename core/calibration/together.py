@@ -31,7 +31,7 @@ from .network import BarNetwork
 from .precision import displaced
 from .quality import lengths_of
 from .reference_bar import COARSE_CAUCHY_PX, GATE, WIDE_GATE, initial_network
-from .self_calibration import Calibration, calibrate_from
+from .self_calibration import Calibration, calibrate_from, delays_of_bars
 from .verdict import refuse_if_useless
 
 OTHER_SCALE = 0.02  # by which bars and boards differ in length: no rig fits both
@@ -67,7 +67,7 @@ def calibrate_together(both: BarAndBoard, monitor: Monitor, focal_px: float | No
         refuse_if_useless(alone)
         board = partial_network(alone.network, alone.observations, alone.used, alone.sigma0_px, lenses_only=False)
         remarks, doubt = alone.remarks, alone.doubt
-    done = calibrate_from(lambda some: _start(some, board), both.bars, monitor, _flat(both.bars, board), board)
+    done = calibrate_from(lambda some: _start(some, board), both.bars, monitor, lambda raw: delays_of_bars(_flat(raw, board)), board)
     F = _variance_factor(done, board)
     doubts = [doubt, _scale_doubt(done, board), _contradiction(done, board)]
     if F > SIGNIFICANT:

@@ -12,7 +12,7 @@ from ..calibration.bars import BarObservations
 from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
-from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, open_boards, write_report
+from ..calibration.calibrate import Start, Starts, calibrate_rig, measure_bar, open_bar, open_boards, write_report
 from ..calibration.rig_files import read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
@@ -132,14 +132,13 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
 
 
 def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> BarObservations | BoardObservations | BarAndBoard:
-    firsts = None if args.synchronise is None else partial(_first_images, args, monitor, args.bar)
+    starts = _starts(args, monitor, args.bar)
     if board is not None and args.with_board is None:
-        return measure_boards(open_boards(args.bar, firsts), board, monitor)
-    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field, firsts)
+        return measure_boards(open_boards(args.bar, starts), board, monitor)
+    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field, starts)
     if board is None:
         return measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations
-    firsts = None if args.synchronise is None else partial(_first_images, args, monitor, args.with_board)
-    boards = open_boards(args.with_board, firsts, together=not args.lenses_only)
+    boards = open_boards(args.with_board, _starts(args, monitor, args.with_board), together=not args.lenses_only)
     check_names(footage.names, boards.names)
     return BarAndBoard(
         bars=measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations,
@@ -148,16 +147,23 @@ def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -
     )
 
 
-def _first_images(
-    args: argparse.Namespace, monitor: Monitor, folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]
-) -> tuple[int, ...]:
-    from ..synchronising.bar_and_board import first_images
+def _starts(args: argparse.Namespace, monitor: Monitor, folder: Path) -> Starts | None:
+    """Finds what belongs together in the films of a folder; None where images of the same number do."""
+    if args.synchronise is not None and args.rates is not None:
+        raise InputError("Give the rates with --synchronise, such as --synchronise L=24,C=30,R=60, or with --rates, not with both.")
+    return None if args.synchronise is None and args.rates is None else partial(_start, args, monitor, folder)
 
-    if not 0.1 <= args.synchronise <= 10_000:
-        raise InputError(f"--synchronise is {args.synchronise:g}; give the images per second of all views, such as 30.")
-    firsts, timings = first_images(folder, names, sequences, args.synchronise, monitor, args.movie_sound)
+
+def _start(args: argparse.Namespace, monitor: Monitor, folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> Start:
+    from ..synchronising.bar_and_board import common_start
+
+    if args.rates is not None and "=" not in args.rates:
+        raise InputError(f"--rates is {args.rates}; give the images per second of each view, such as L=24,C=30,R=60.")
+    by_sound = args.synchronise is not None
+    rates = str(args.synchronise if by_sound else args.rates)
+    start, timings = common_start(folder, names, sequences, rates, monitor, args.movie_sound, by_sound)
     args.started = [*args.started, *(str(timing) for timing in timings)]
-    return firsts
+    return start
 
 
 def _world(args: argparse.Namespace) -> WorldChoice:

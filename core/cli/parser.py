@@ -169,8 +169,11 @@ def _calibrate(commands: Any) -> None:
     about = "the model of the lenses; auto: the one that fits the images, with a board that of each camera"
     parser.add_argument("--lens", choices=LENSES, default="auto", help=about)
     parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")
-    about = "images per second; finds when each view began: by sound (NAME.wav; in Blender the movie's own), light or time codes"
-    parser.add_argument("--synchronise", type=float, metavar="F", help=about)
+    about = "images per second (30, or L=24,C=30,R=60); finds when each view began: by sound (NAME.wav; in Blender the movie's), light, …"
+    parser.add_argument("--synchronise", metavar="F", help=about)
+    parser.add_argument(
+        "--rates", metavar="L=24,…", help="images per second of each view, if they differ, of films that begin at the same instant"
+    )
     parser.set_defaults(movie_sound=None, started=[])  # the add-on's command reads that of movies
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument(

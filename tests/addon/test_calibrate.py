@@ -19,7 +19,7 @@ from ..core.synchronising.test_synchronise import heard, world, write_wav
 from .conftest import small_rig
 from .layout import Layout
 
-FRAMES = 24
+FRAMES = 30
 ADDON = "bl_ext.user_default.tricap.addon"
 
 
@@ -71,6 +71,21 @@ def test_cameras_that_were_started_one_by_one(blender, empty, bar: Path, tmp_pat
         assert min(m.frame for m in markers) == first + 1 and max(m.frame for m in markers) <= first + 37
         places[view] = len(markers)
     assert min(places.values()) > 20
+
+
+def test_cameras_at_different_rates(blender, empty, bar: Path, tmp_path: Path) -> None:
+    """L takes every second image of the others."""
+    for view in "LCR":
+        (tmp_path / "mixed" / view).mkdir(parents=True)
+        for n, file in enumerate(sorted((bar / view).glob("*.png"))[:: 2 if view == "L" else 1]):
+            (tmp_path / "mixed" / view / f"{n:04d}.png").symlink_to(file)
+    props = empty.context.scene.tricap_calibrate
+    props.bar, props.length_m, props.rates = str(tmp_path / "mixed"), 0.5, "L=12.5, C=25"
+    with pytest.raises(RuntimeError, match="lacks the view R"):
+        empty.ops.tricap.calibrate()
+    props.rates = "L=12.5, C=25, R=25"
+    assert empty.ops.tricap.calibrate() == {"FINISHED"}
+    assert read_rig(tmp_path / "rig.toml").metadata["positions"] <= FRAMES // 2
 
 
 def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_path: Path) -> None:
