@@ -16,7 +16,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
-from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, LaterPart, open_sequence, read_image
+from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart, read_image
 from . import report, verdict
 from .bar_lenses import calibrate_bar
 from .bars import BarObservations
@@ -30,6 +30,7 @@ from .report import pictures
 from .self_calibration import Calibration
 from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
 from .together import BarAndBoard, calibrate_together
+from .view_files import open_views
 from .world_frame import WorldChoice, frame_of_bar
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with both targets
@@ -100,36 +101,6 @@ def open_bar(
     return BarFootage(
         folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field, clocks=clocks
     )
-
-
-def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, ...], tuple[ImageSequence, ...]]:
-    """Names and sequences of the cameras in a folder that has a folder of images, or a movie, for each; `gaps`: images may be missing.
-
-    Raises:
-        InputError: the folder is missing, or has fewer than two views.
-    """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the folder that has one folder of images or one movie of the {noun} per camera.")
-    names: list[str] = []
-    sequences: list[ImageSequence] = []
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            endings = {p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS}
-            if endings:
-                ending = max(sorted(endings), key=lambda e: sum(1 for _ in path.glob(f"*{e}")))
-                names.append(path.name)
-                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name, gaps=gaps))
-        elif path.suffix.lower() in MOVIE_ENDINGS:
-            names.append(path.stem)
-            sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
-    if len(names) < 2:
-        raise InputError(
-            f"{folder} has {'no views' if not names else 'only the view ' + names[0]}; "
-            "it needs a folder of images, or a movie, for each of at least two cameras."
-        )
-    return tuple(names), tuple(sequences)
 
 
 def _started(

@@ -12,7 +12,7 @@ from ...foundation.progress import Monitor
 from ...images.sequence import ImageFiles, ImageSequence
 from ..clocks import Clocks, corners_at_common_instants
 from .board import DICTIONARIES, Board, BoardKind
-from .detection import MIRRORED, VARIANTS, Variant, find_corners, find_variant
+from .detection import FEWEST_CORNERS, MIRRORED, VARIANTS, Variant, find_corners, find_variant
 from .observations import BoardObservations
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with the board
@@ -183,6 +183,8 @@ def _refuse(footage: BoardFootage, c: int, wanted: list[np.ndarray], board: Boar
         for other in DICTIONARIES:
             if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:2])[1]:
                 raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
+        if (other_size := _other_charuco(images, board)) is not None:
+            raise InputError(f"{start} squares, but one of {other_size.label}; give {other_size.label}.")
     elif (other_size := _other_size(images[:: max(1, len(images) // GUESSED_IMAGES)], board)) is not None:
         raise InputError(
             f"{start} {counted}, but one of {other_size.label}: inner corners are where four squares meet; give {other_size.label}."
@@ -202,6 +204,20 @@ def _other_size(images: list[np.ndarray], board: Board) -> Board | None:
         if any(np.isfinite(find_corners(image, guess)).any() for image in images):
             return guess
     return None
+
+
+def _other_charuco(images: list[np.ndarray], board: Board) -> Board | None:
+    """The ChArUco board of another size that most corners in the images belong to: across and down exchanged, or miscounted."""
+    across, down = board.squares
+    found: list[tuple[int, Board]] = []
+    for size in ((down, across), *((across + a, down + d) for a, d in NEAR_SIZES)):
+        try:
+            guess = Board(kind=board.kind, squares=size, square_m=board.square_m, dictionary=board.dictionary, marker_m=board.marker_m)
+        except InputError:  # too few corners, or markers
+            continue
+        found.append((find_variant(images, guess, VARIANTS[:2])[1], guess))
+    count, best = max(found, key=lambda pair: pair[0], default=(0, board))
+    return best if count >= FEWEST_CORNERS else None
 
 
 def _other_markers(board: Board, dictionary: str) -> Board | None:

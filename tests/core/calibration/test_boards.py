@@ -364,6 +364,13 @@ def test_images_without_a_board_are_refused(tmp_path: Path, capsys: pytest.Captu
     assert "View L" in (shown := capsys.readouterr().err) and "never shows the chessboard of 9×6 inner corners" in shown
 
 
+def test_a_charuco_board_whose_sides_were_exchanged_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    filmed(tmp_path / "board", CHARUCO, tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2]), 4)
+    described = ["--board", "charuco", "--squares", "4x5", "--square", "0.14", "--dictionary", "DICT_5X5_100"]
+    assert main(["calibrate", str(tmp_path / "board"), *described, "--out", str(tmp_path / "rig.toml")]) == 2
+    assert "but one of 5×4; give 5×4" in capsys.readouterr().err
+
+
 def test_a_board_whose_squares_were_counted_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2])
     filmed(tmp_path / "board", CHESSBOARD, cameras, 3)
