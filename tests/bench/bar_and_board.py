@@ -3,7 +3,7 @@
     .venv/py3.13/bin/python tests/bench/bar_and_board.py [--sets 210] [--first SEED] [--seconds S] [--record FILE]
 
 Every set is a random rig with 60 bars and 20 boards. One of KINDS spoils the cameras of the board, the length of the bar or the squares, by
-0.03 to 3 %. A rig is wrong if points in space are more than WRONG times as far off as the Cramér–Rao bound of the set without the fault, and
+0.03 to 3 %. A rig is wrong if points in space are more than WRONG times as far off as the Cramér–Rao bound without the fault, and
 by more than FAR_PART of their distance: less is not told apart from the systematic errors of image points.
 """
 
