@@ -40,7 +40,8 @@ class FileState:
     click_problems: dict[tuple[Any, ...], str] = field(default_factory=dict)  # by joint, clicks and cameras; "" where there is none
     mends: dict[str, Any] = field(default_factory=dict)  # by checked input: what its check found that a press mends (steps.check.Mends)
     checked_keys: set[str] = field(default_factory=set)  # inputs for which a check began by itself
-    bar_counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # by view: images searched, and images that show the whole bar
+    # by view and target: images searched, and images that show it:
+    bar_counts: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
     open_results: OpenResults = field(default_factory=OpenResults)
     inspection: tuple[int, Any] = (-1, None)  # the frame, and what is under the pointer in it (overlay.layers.Inspection)
     inspecting: bool = False  # the modal operator of the inspection runs

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,8 +26,10 @@ from ..steps.cameras import use_rig
 from .cameras import build_cameras, rig_of_scene
 
 if TYPE_CHECKING:
+    from ...core.calibration.bars import BarObservations
     from ...core.calibration.boards.footage import BoardFootage
-    from ...core.calibration.calibrate import BarFootage, CalibratedRig, Firsts, MeasuredBar
+    from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar, Starts
+    from ...core.calibration.together import BarAndBoard
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -78,7 +81,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         """Folder, target and options as they are now."""
         from ...core.calibration import calibrate
         from ...core.calibration.boards.footage import measure_boards
-        from ...core.synchronising.bar_and_board import first_images
+        from ...core.synchronising.bar_and_board import common_start
         from ..movie_sound import movie_sound
 
         props = context.scene.tricap_calibrate
@@ -93,23 +96,28 @@ class Calibrate(JobOperator, bpy.types.Operator):
         focal, lens = props.focal_px if props.focal_px > 0 else None, Lens(props.lens)
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
-        board = None if props.target == "WAND" else board_of(props)
-        fps = props.started_fps
+        target, rates, by_sound = props.target, props.rates.strip() or f"{props.started_fps:g}", props.started_fps > 0
+        beside = _board_beside(props) if target == "WAND" and props.board_footage else None
+        board = None if target == "WAND" else board_of(props, target)
         get_session().file.bar_counts.clear()
 
-        def firsts_at(monitor: Monitor) -> "Firsts | None":
-            return None if fps <= 0 else lambda names, views: first_images(folder, names, views, fps, monitor, movie_sound)[0]
+        def starts(there: Path, monitor: Monitor) -> "Starts | None":
+            if not by_sound and "=" not in rates:
+                return None
+            return lambda names, views: common_start(there, names, views, rates, monitor, movie_sound, by_sound)[0]
 
         def from_wand(monitor: Monitor) -> Done:
-            footage = calibrate.open_bar(folder, interlaced, mask, first_field, firsts_at(monitor))
-            measured = calibrate.measure_bar(footage, length, monitor, note_count, diameter or None)
-            result = calibrate.calibrate_rig(measured.observations, monitor, focal_px=focal, world=world)
+            footage = calibrate.open_bar(folder, interlaced, mask, first_field, starts(folder, monitor))
+            shown = beside and beside.opened(footage.names, starts(beside.folder, monitor))
+            measured = calibrate.measure_bar(footage, length, monitor, partial(note_count, target), diameter or None)
+            observations = measured.observations if not (beside and shown) else beside.measured(measured.observations, shown, monitor)
+            result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
             return compute_wand(footage, measured, result, out)
 
         def from_board(monitor: Monitor) -> Done:
             assert board is not None
-            footage = calibrate.open_boards(folder, firsts_at(monitor))
-            observations = measure_boards(footage, board, monitor, note_count)
+            footage = calibrate.open_boards(folder, starts(folder, monitor))
+            observations = measure_boards(footage, board, monitor, partial(note_count, target))
             result = calibrate.calibrate_rig(observations, monitor, focal_px=focal, lens=lens, world=world)
             write(result, out)
             return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out, firsts=firsts_of(footage))
@@ -135,9 +143,43 @@ class Calibrate(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def note_count(view: str, images: int, whole: int) -> None:
-    """`whole` of the first `images` images of a view show both targets; the panel shows it while the job runs."""
-    get_session().file.bar_counts[view] = images, whole
+@dataclass(frozen=True, kw_only=True)
+class BoardBeside:
+    """A board that the same cameras filmed besides the wand."""
+
+    folder: Path
+    board: Board
+    lenses_only: bool
+
+    def opened(self, names: tuple[str, ...], starts: "Starts | None") -> "BoardFootage":
+        """Its footage.
+
+        Raises:
+            InputError: it is missing, or of other cameras than the wand's.
+        """
+        from ...core.calibration.calibrate import open_boards
+        from ...core.calibration.together import check_names
+
+        footage = open_boards(self.folder, starts, together=not self.lenses_only)
+        check_names(names, footage.names)
+        return footage
+
+    def measured(self, bars: "BarObservations", footage: "BoardFootage", monitor: Monitor) -> "BarAndBoard":
+        """The observations of both."""
+        from ...core.calibration.boards.footage import measure_boards
+        from ...core.calibration.together import BarAndBoard
+
+        boards = measure_boards(footage, self.board, monitor, partial(note_count, self.board.kind.value))
+        return BarAndBoard(bars=bars, boards=boards, lenses_only=self.lenses_only)
+
+
+def _board_beside(props: bpy.types.PropertyGroup) -> BoardBeside:
+    return BoardBeside(folder=folders.absolute(props.board_footage), board=board_of(props, props.board_kind), lenses_only=props.lenses_only)
+
+
+def note_count(target: str, view: str, images: int, whole: int) -> None:
+    """`whole` of the first `images` images of a view show the target; the panel shows it while the job runs."""
+    get_session().file.bar_counts[view, target] = images, whole
 
 
 def frame_numbers(text: str) -> tuple[int, ...]:
@@ -157,19 +199,19 @@ def typed(value: float) -> float:
     return float(f"{value:.7g}")
 
 
-def board_of(props: bpy.types.PropertyGroup) -> Board:
-    """The board that the panel describes.
+def board_of(props: bpy.types.PropertyGroup, kind: str) -> Board:
+    """The board of a kind that the panel describes.
 
     Raises:
         InputError: it is impossible.
     """
     across, down = props.squares
     return Board(
-        kind=BoardKind(props.target),
+        kind=BoardKind(kind),
         squares=(across, down),
         square_m=typed(props.square_m),
         dictionary=props.dictionary,
-        marker_m=typed(props.marker_m) if props.target == BoardKind.CHARUCO else 0.0,
+        marker_m=typed(props.marker_m) if kind == BoardKind.CHARUCO else 0.0,
     )
 
 
@@ -222,7 +264,7 @@ class PrintBoard(TellingOperator, ExportHelper, bpy.types.Operator):
         props = context.scene.tricap_calibrate
         if props.target == "WAND":
             raise InputError("Choose ChArUco or Checkerboard first; a wand is not printed.")
-        board, path = board_of(props), folders.absolute(self.filepath)
+        board, path = board_of(props, props.target), folders.absolute(self.filepath)
         write_board(path, board)
         return f"A {board.kind.value} of {board.label} in {path}. Print it without scaling."
 

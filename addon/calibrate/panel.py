@@ -17,6 +17,7 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.prop(props, "bar")
     (_wand if props.target == "WAND" else _board)(layout, props)
     layout.prop(props, "started_fps")
+    layout.prop(props, "rates", placeholder="only if they differ: L=24, C=30")
     layout.prop(props, "focal_px")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")
@@ -25,9 +26,9 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row.scale_y = 1.3
     row.enabled = bool(props.bar)
     row.operator("tricap.calibrate", icon="OUTLINER_OB_CAMERA")
-    noun = "wand" if props.target == "WAND" else "board"
-    for view, (frames, whole) in list(get_session().file.bar_counts.items()):
-        layout.label(text=f"{view}: {whole} of {frames} images show the {noun}", icon=LIGHTS[light_of(whole, props.target)])
+    for (view, target), (frames, whole) in list(get_session().file.bar_counts.items()):
+        noun = "wand" if target == "WAND" else "board"
+        layout.label(text=f"{view}: {whole} of {frames} images show the {noun}", icon=LIGHTS[light_of(whole, target)])
     if props.verdict and not running:
         box = layout.box()
         sentence(box, context, props.verdict, LIGHTS.get(props.light, "NONE"))
@@ -45,15 +46,24 @@ def _wand(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
         layout.prop(props, "first_field")
     layout.prop(props, "diameter_m")
     layout.prop(props, "mask")
+    layout.prop(props, "board_footage")
+    if props.board_footage:
+        layout.row().prop(props, "board_kind", expand=True)
+        _squares(layout, props, props.board_kind)
+        layout.prop(props, "lenses_only")
     layout.prop(props, "lens")
 
 
-def _board(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
-    layout.row().prop(props, "squares", text="Squares" if props.target == "charuco" else "Inner Corners")
+def _squares(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup, kind: str) -> None:
+    layout.row().prop(props, "squares", text="Squares" if kind == "charuco" else "Inner Corners")
     layout.prop(props, "square_m")
-    if props.target == "charuco":
+    if kind == "charuco":
         layout.prop(props, "marker_m")
         layout.prop(props, "dictionary")
+
+
+def _board(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
+    _squares(layout, props, props.target)
     layout.prop(props, "lens")
     layout.operator("tricap.print_board", icon="EXPORT")
 

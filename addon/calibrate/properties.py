@@ -69,6 +69,22 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         precision=4,
         description="Distance between the centres of the two targets of the wand",
     )
+    board_footage: bpy.props.StringProperty(
+        name="Board Too",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder like that of the wand, in which the same cameras show a board: both go into one adjustment. Empty: no board",
+    )
+    board_kind: bpy.props.EnumProperty(
+        name="Board",
+        items=TARGETS[1:],  # type: ignore[valid-type]
+        description="The board that was filmed besides the wand",
+    )
+    lenses_only: bpy.props.BoolProperty(
+        name="Board for Lenses Only",
+        default=False,  # type: ignore[valid-type]
+        description="The cameras were moved between the films of the wand and of the board, or filmed the board one after another",
+    )
     started_fps: bpy.props.FloatProperty(
         name="Started Separately [FPS]",
         default=0.0,
@@ -76,6 +92,10 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         max=1000.0,  # type: ignore[valid-type]
         description="Images per second of cameras that were started one by one: when each of them began is found by its sound, by light or "
         "by time codes. 0: all films begin at the same instant",
+    )
+    rates: bpy.props.StringProperty(
+        name="FPS of Views",
+        description="Images per second of each camera where they differ, such as L=24, C=30, R=60. Empty: the same for all",
     )
     interlaced: bpy.props.EnumProperty(
         name="Interlacing",

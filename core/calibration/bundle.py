@@ -8,6 +8,10 @@
 
 The eleventh is how late the camera is, on which its image points x_ick then depend (`delays`).
 
+Another object that the same cameras filmed takes part by its own S and right side (3) at cameras c₀ (Helmert's method of partial networks):
+
+    S Δc = … ,   S ← S + (s / s')² S' ,   g_c ← g_c + (s / s')² (r' − S' (c − c₀))       (5)   s': sigma of its image points
+
 The second sum of (1) is the prior of the interior unknowns, as pseudo-observations (`reference_bar.lens_prior`); s is the sigma of the
 image points. The scale comes from the object, so G has six columns. All normal equations are float64; one step costs O(N C² + N C K).
 Internally, positions are the last axis of every array and are processed in blocks: the small products of (2) and (3) then run over many
@@ -20,7 +24,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from ..geometry.camera import INTERIOR, columns_of_derivatives, columns_of_exterior, image_of
-from ..geometry.rotation import cross_matrix, rotation_from_vector
+from ..geometry.rotation import cross_matrix, rotation_from_vector, vector_from_rotation
 from .delays import MovingPoints
 from .network import Network
 
@@ -40,6 +44,38 @@ CONVERGED = 1e-4  # decrease of the sum of squares in units of σ0² per unknown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Block:
+    """The reduced normal equations of another object that the same cameras filmed: all unknowns of a camera but its delay.  (5)"""
+
+    interior: np.ndarray  # (C, 10) of the cameras at which they were formed
+    R: np.ndarray  # (C, 3, 3)
+    t: np.ndarray  # (C, 3)
+    S: np.ndarray  # (16 C, 16 C) for sigma 1 px
+    rhs: np.ndarray  # (16 C,)
+    sigma_px: float
+
+    def cost(self, network: Network, unit_px: float) -> float:
+        """Its part of the sum (1), less that at its own cameras."""
+        change = change_of_cameras(network, self)
+        return float((unit_px / self.sigma_px) ** 2 * (change @ self.S @ change - 2 * self.rhs @ change))
+
+    def add_to(self, V: np.ndarray, g_c: np.ndarray, network: Network, columns: np.ndarray, unit_px: float) -> None:
+        """Add it to normal equations of the camera unknowns `columns`.  (5)"""
+        every, own = np.arange(len(network.R))[:, None], np.flatnonzero(columns != DELAY)
+        of_block, of_sum = (every * 16 + columns[own]).ravel(), (every * len(columns) + own).ravel()
+        weight = (unit_px / self.sigma_px) ** 2
+        V[np.ix_(of_sum, of_sum)] += weight * self.S[np.ix_(of_block, of_block)]
+        g_c[of_sum] += weight * (self.rhs - self.S @ change_of_cameras(network, self))[of_block]
+
+
+def change_of_cameras(network: Network, before: Network | Block) -> np.ndarray:
+    """The step (16 C,) of all unknowns of the cameras, but their delays, that leads to those of a network."""
+    turn = network.R @ before.R.transpose(0, 2, 1)
+    shift = network.t - (turn @ before.t[..., None])[..., 0]
+    return np.concatenate([network.interior - before.interior, vector_from_rotation(turn), shift], axis=1).ravel()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Unknowns:
     """Which interior unknowns are free in all cameras, their prior, and whether the delays of the cameras are free."""
 
@@ -47,6 +83,7 @@ class Unknowns:
     expected: np.ndarray  # (C, 10)
     sigma: np.ndarray  # (C, 10) of the expected values
     expected_delay_images: np.ndarray | None = None  # (C,); None: no delays
+    block: Block | None = None  # of another object
 
     @property
     def columns(self) -> np.ndarray:
@@ -63,6 +100,11 @@ class Unknowns:
     def in_step(self) -> "Unknowns":
         """The same without delays."""
         return replace(self, expected_delay_images=None)
+
+    @property
+    def alone(self) -> "Unknowns":
+        """The same without another object."""
+        return replace(self, block=None)
 
     def only(self, *names: str) -> "Unknowns":
         """The same prior with only these unknowns free."""
@@ -198,6 +240,8 @@ def _add_pseudo_observations(V: np.ndarray, g_c: np.ndarray, network: Network, u
         P = (unit_px / sigma[c]) ** 2
         V[at, at] += P
         g_c[at] += P * off[c]
+    if unknowns.block is not None:
+        unknowns.block.add_to(V, g_c, network, unknowns.columns, unit_px)
 
 
 def _pseudo_observations(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
@@ -211,9 +255,10 @@ def _pseudo_observations(network: Network, unknowns: Unknowns) -> tuple[np.ndarr
 
 
 def pseudo_cost(network: Network, unknowns: Unknowns, unit_px: float) -> float:
-    """The second sum of (1)."""
+    """The second sum of (1), and what another object adds."""
     off, sigma = _pseudo_observations(network, unknowns)
-    return float(unit_px**2 * np.sum((off / sigma) ** 2))
+    other = 0.0 if unknowns.block is None else unknowns.block.cost(network, unit_px)
+    return float(unit_px**2 * np.sum((off / sigma) ** 2)) + other
 
 
 def free_network(network: Network, unknowns: Unknowns) -> np.ndarray:

@@ -4,7 +4,7 @@ BARDIR has a folder of images or a movie per camera; their names are the names o
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
-from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, LaterPart, open_sequence, read_image
+from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart, read_image
 from . import report, verdict
 from .bar_lenses import calibrate_bar
 from .bars import BarObservations
@@ -24,10 +24,13 @@ from .boards.board import Lens
 from .boards.calibration import calibrate_boards
 from .boards.footage import BoardFootage, numbered
 from .boards.observations import BoardObservations
+from .clocks import Clocks, at_common_instants
 from .quality import Quality, assess
 from .report import pictures
 from .self_calibration import Calibration
 from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
+from .together import BarAndBoard, calibrate_together
+from .view_files import open_views
 from .world_frame import WorldChoice, frame_of_bar
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with both targets
@@ -47,16 +50,17 @@ class BarFootage:
     interlaced: str = "none"  # or "odd", "even", "both"
     masks: tuple[np.ndarray | None, ...] = ()  # of each view (h, w), False where no target can be; empty: none
     first_field: str = "odd"  # of "both"
+    clocks: Clocks | None = None  # of films at different rates
 
     @property
     def field_layout(self) -> FieldLayout:
         """Which rows of which image show a frame: an image, or one of its two fields where both are measured."""
         return field_layout(self.interlaced, self.first_field)
 
-    @property
-    def count(self) -> int:
-        """Number of frames that all views have."""
-        return min(s.count for s in self.sequences) * self.field_layout.per_image
+    def count(self, view: int) -> int:
+        """Number of frames of a view: its own, or those that all views have."""
+        images = self.sequences[view].count if self.clocks is not None else min(s.count for s in self.sequences)
+        return images * self.field_layout.per_image
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -67,82 +71,61 @@ class MeasuredBar:
     observations: BarObservations
 
 
-Firsts = Callable[[tuple[str, ...], tuple[ImageSequence, ...]], tuple[int, ...]]
+Start = tuple[int, ...] | Clocks  # the images of the views that were taken at once, or the clocks of films at different rates
+Starts = Callable[[tuple[str, ...], tuple[ImageSequence, ...]], Start]  # finds it
 
 
 def open_bar(
-    folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd", firsts: Firsts | None = None
+    folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd", starts: Starts | None = None
 ) -> BarFootage:
     """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
 
     With `interlaced` "both" each image shows the bar at two instants; the `first_field` is the earlier one.
 
-    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one. `firsts` finds the
-    images of the views that were taken at once.
+    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
 
     Raises:
         InputError: the folder is missing, has fewer than two views, or views of different length; a mask belongs to no camera.
     """
     folder = Path(folder)
     names, sequences = open_views(folder, "bar")
-    sequences = sequences if firsts is None else _common(sequences, firsts(names, sequences))
+    sequences, clocks = _started(names, sequences, starts)
     counts = {name: s.count for name, s in zip(names, sequences)}
-    if len(set(counts.values())) > 1:
+    if clocks is None and len(set(counts.values())) > 1:
         lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(
             f"The views in {folder} have different numbers of frames ({lengths}); "
             "trim them to the same instants, or let `tricap calibrate --synchronise` find them by their sound."
         )
     masks = () if mask is None else _masks(Path(mask), names)
-    return BarFootage(folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field)
+    return BarFootage(
+        folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field, clocks=clocks
+    )
 
 
-def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, ...], tuple[ImageSequence, ...]]:
-    """Names and sequences of the cameras in a folder that has a folder of images, or a movie, for each; `gaps`: images may be missing.
-
-    Raises:
-        InputError: the folder is missing, or has fewer than two views.
-    """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the folder that has one folder of images or one movie of the {noun} per camera.")
-    names: list[str] = []
-    sequences: list[ImageSequence] = []
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            endings = {p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS}
-            if endings:
-                ending = max(sorted(endings), key=lambda e: sum(1 for _ in path.glob(f"*{e}")))
-                names.append(path.name)
-                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name, gaps=gaps))
-        elif path.suffix.lower() in MOVIE_ENDINGS:
-            names.append(path.stem)
-            sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
-    if len(names) < 2:
-        raise InputError(
-            f"{folder} has {'no views' if not names else 'only the view ' + names[0]}; "
-            "it needs a folder of images, or a movie, for each of at least two cameras."
-        )
-    return tuple(names), tuple(sequences)
+def _started(
+    names: tuple[str, ...], sequences: tuple[ImageSequence, ...], starts: Starts | None
+) -> tuple[tuple[ImageSequence, ...], Clocks | None]:
+    """What all sequences have in common if images of theirs were taken at once; or all of them, with the clocks of different rates."""
+    found = None if starts is None else starts(names, sequences)
+    if isinstance(found, Clocks):
+        found.check_overlap(names, [s.count for s in sequences])
+    if found is None or isinstance(found, Clocks):
+        return sequences, found
+    count = min(s.count - first for s, first in zip(sequences, found))
+    return tuple(LaterPart(s, first, count) for s, first in zip(sequences, found)), None
 
 
-def _common(sequences: tuple[ImageSequence, ...], firsts: tuple[int, ...]) -> tuple[ImageSequence, ...]:
-    """What all sequences have in common if their images `firsts` were taken at once."""
-    count = min(s.count - first for s, first in zip(sequences, firsts))
-    return tuple(LaterPart(s, first, count) for s, first in zip(sequences, firsts))
-
-
-def open_boards(folder: Path, firsts: Firsts | None = None) -> BoardFootage:
+def open_boards(folder: Path, starts: Starts | None = None, together: bool = True) -> BoardFootage:
     """Open the sequences of a board in BOARDDIR: one folder of images, or one movie, per camera; images of the same number belong together,
-    or those that `firsts` finds.
+    or those that `starts` finds, if they were taken `together`.
 
     Raises:
-        InputError: the folder is missing, has fewer than two views, or movies of different length.
+        InputError: the folder is missing, has fewer than two views, or movies of different length that were taken together.
     """
     names, sequences = open_views(Path(folder), "board", gaps=True)
-    sequences = sequences if firsts is None else _common(sequences, firsts(names, sequences))
-    return numbered(Path(folder), names, sequences)
+    sequences, clocks = _started(names, sequences, starts if together else None)
+    return numbered(Path(folder), names, sequences, together, clocks)
 
 
 def _masks(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray | None, ...]:
@@ -179,16 +162,20 @@ def measure_bar(
         _check_view(footage, view, track, size[0])
         tracks.append(track)
         sizes.append(size)
+    frames, xy = _at_once(footage, tracks)
     observations = BarObservations(
-        names=footage.names,
-        size_px=np.array(sizes, dtype=np.float64),
-        xy_px=np.stack([t.xy_px for t in tracks], axis=1),
-        length_m=length_m,
-        frames=np.arange(footage.count),
-        labelled=False,
+        names=footage.names, size_px=np.array(sizes, dtype=np.float64), xy_px=xy, length_m=length_m, frames=frames, labelled=False
     )
     _check_positions(footage, observations)
     return MeasuredBar(tracks=tuple(tracks), observations=observations)
+
+
+def _at_once(footage: BarFootage, tracks: Sequence[BarTrack]) -> tuple[np.ndarray, np.ndarray]:
+    """The frames (N,), and the ends (N, C, 2, 2) of the bar in them."""
+    numbers = [np.arange(len(t.xy_px)) for t in tracks]
+    if footage.clocks is None:
+        return numbers[0], np.stack([t.xy_px for t in tracks], axis=1)
+    return at_common_instants(footage.clocks.of_fields(footage.field_layout.per_image), numbers, [t.xy_px for t in tracks])
 
 
 def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float) -> tuple[BarTrack, tuple[int, int]]:
@@ -197,8 +184,9 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
     mask = footage.masks[view] if footage.masks else None
     found: list[Targets] = []
     size, whole = (0, 0), 0
-    for n in range(footage.count):
-        monitor.step(f"targets {name}", n, footage.count)
+    count = footage.count(view)
+    for n in range(count):
+        monitor.step(f"targets {name}", n, count)
         image, rows = sequence.read(footage.field_layout.image(n)), footage.field_layout.rows(n)
         if n and image.shape[::-1] != size:
             raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
@@ -213,7 +201,7 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
         whole += int(moved_targets(found[-2:]) >= 2)
         if note is not None:
             note(name, len(found), whole)
-    monitor.step(f"targets {name}", footage.count, footage.count)
+    monitor.step(f"targets {name}", count, count)
     return track_bar(found, float(size[0]), diameter / np.sqrt(footage.field_layout.first.step)), size
 
 
@@ -266,20 +254,22 @@ class CalibratedRig:
 
 
 def calibrate_rig(
-    observations: BarObservations | BoardObservations,
+    observations: BarObservations | BoardObservations | BarAndBoard,
     monitor: Monitor,
     *,
     focal_px: float | None = None,
     lens: Lens = Lens.AUTO,
     world: WorldChoice | None = None,
 ) -> CalibratedRig:
-    """Calibrate from the observations of the bar or the board, judge the result, and put it into the world's frame.
+    """Calibrate from the observations of the bar, the board or both, judge the result, and put it into the world's frame.
 
     Raises:
         InputError: the data do not determine the rig or the world's frame; the message names what is missing.
     """
     world = world or WorldChoice()
-    if isinstance(observations, BarObservations):
+    if isinstance(observations, BarAndBoard):
+        calibration = calibrate_together(observations, monitor, focal_px, lens)
+    elif isinstance(observations, BarObservations):
         calibration = calibrate_bar(observations, monitor, focal_px, lens)
     else:
         calibration = calibrate_boards(observations, monitor, focal_px, lens)
@@ -291,7 +281,7 @@ def calibrate_rig(
     metadata = {
         "unit": "m",
         "sigma0_px": calibration.sigma0_px,
-        **observations.described,
+        **calibration.described,
         "positions": verdict.positions_used(calibration),
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
@@ -299,7 +289,7 @@ def calibrate_rig(
         **({} if judged.light is verdict.Light.GREEN else {"light": judged.light.value}),
         "floor": world.on_floor,
     }
-    cameras = calibration.network.cameras(observations.names, observations.size_px)
+    cameras = calibration.network.cameras(calibration.observations.names, calibration.observations.size_px)
     rig = Rig(cameras=cameras, metadata=metadata, sigmas=report.camera_sigmas(calibration))
     return CalibratedRig(rig=rig, calibration=calibration, quality=quality, verdict=judged)
 
@@ -315,7 +305,11 @@ def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     known = observations.measured(calibration.used)
     frame = frame_of_bar(world, cameras, observations.frames[known], network.points_m[known])
     moved = network.transformed(frame.R, frame.shift_m)
-    return replace(calibration, network=moved.with_cameras([frame.camera(c) for c in cameras]))
+    moved = moved.with_cameras([frame.camera(c) for c in cameras])
+    if calibration.other is None:
+        return replace(calibration, network=moved)
+    other = calibration.other.moved(frame)
+    return replace(calibration, network=moved, other=other, unknowns=replace(calibration.unknowns, block=other.block))
 
 
 def write_report(folder: Path, result: CalibratedRig) -> list[Path]:

@@ -186,6 +186,14 @@ def first_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> n
     return delay
 
 
+def misfit(moving: MovingPoints, size_px: np.ndarray, delay_images: np.ndarray, labelled: bool) -> float:
+    """Mean distance of the points of all pairs of cameras from their epipolar lines, in image widths, at these delays.  (3)"""
+    C = len(size_px)
+    pairs = [(i, j) for i in range(C) for j in range(i + 1, C)]
+    every = [_distance(moving, size_px, pair, float(delay_images[pair[1]] - delay_images[pair[0]]), labelled) for pair in pairs]
+    return float(np.mean([min(distance, WIDTH) for distance in every]))
+
+
 def _delay_between(moving: MovingPoints, size_px: np.ndarray, pair: tuple[int, int], labelled: bool) -> float:
     """By how many images the second camera is later than the first."""
     at_once, earlier, later = (_distance(moving, size_px, pair, d, labelled) for d in (0.0, -NEARBY, NEARBY))

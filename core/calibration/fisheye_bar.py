@@ -8,19 +8,22 @@ The search for cameras without such lenses (`reference_bar`) finds the poses fro
 the original points, and the guess with the smallest robust sum of squares wins.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..foundation.errors import InputError
 from .bars import BarObservations, labelled_ends, with_bars
-from .bundle import Adjusted, LevenbergMarquardt, adjust
+from .bundle import Adjusted, Block, LevenbergMarquardt, adjust
+from .delays import first_delays, misfit, moving_points
 from .network import BarNetwork
 from .reference_bar import COARSE_CAUCHY_PX, GATE, ROUGH_FOCALS, WIDE_GATE, initial_network, lens_prior
 
 FOCAL_PARTS = np.geomspace(0.22, 0.8, 7)  # focal lengths in widths
 NARROW = np.radians(65)  # from the axis: points further out are not used for the start
 POSITIONS = 120
+WIDE = 4  # times WIDE_GATE, the first tolerance
 
 
 def fisheye_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted[BarNetwork]:
@@ -29,10 +32,9 @@ def fisheye_network(observations: BarObservations, focal_px: float | None = None
     Raises:
         InputError: the cameras share too few bars.
     """
-    grid = focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_PARTS * float(np.median(observations.size_px[:, 0]))
     best: Adjusted[BarNetwork] | None = None
     problem: InputError | None = None
-    for f in grid:
+    for f in _focal_lengths(observations, focal_px):
         try:
             flat = initial_network(_flat(observations, float(f)), float(f))
         except InputError as error:
@@ -45,6 +47,18 @@ def fisheye_network(observations: BarObservations, focal_px: float | None = None
         assert problem is not None
         raise problem
     return best
+
+
+def fisheye_delays(observations: BarObservations, focal_px: float | None = None) -> np.ndarray:
+    """How late each camera is (C,): of the delays found with each guess of the focal length, those at which a guess fits best."""
+    size, labelled = observations.size_px, observations.labelled
+    moving = [moving_points(observations.frames, _flat(observations, float(f)).xy_px) for f in _focal_lengths(observations, focal_px)]
+    found = np.unique([first_delays(guess, size, labelled) for guess in moving], axis=0)
+    return min(found, key=lambda late: min(misfit(guess, size, late, labelled) for guess in moving))
+
+
+def _focal_lengths(observations: BarObservations, focal_px: float | None) -> np.ndarray:
+    return focal_px * ROUGH_FOCALS if focal_px is not None else FOCAL_PARTS * float(np.median(observations.size_px[:, 0]))
 
 
 def _flat(observations: BarObservations, focal_px: float) -> BarObservations:
@@ -62,9 +76,16 @@ def _trial(observations: BarObservations, flat: BarNetwork, focal_px: float) -> 
     interior = np.zeros_like(flat.interior)
     interior[:, 0], interior[:, 1:3] = focal_px, (observations.size_px - 1) / 2
     network = replace(flat, interior=interior, fisheye=np.ones(len(interior), dtype=bool))
+    return adjusted_start(network, observations, ("f", "k1"), (WIDE * WIDE_GATE, WIDE_GATE, GATE))
+
+
+def adjusted_start(
+    network: BarNetwork, observations: BarObservations, names: Sequence[str], gates: Sequence[float], block: Block | None = None
+) -> Adjusted[BarNetwork]:
+    """A short robust adjustment on a part of the positions, with these unknowns of the lenses, and tolerances that become narrower."""
     some = observations.part(np.unique(np.linspace(0, len(observations.xy_px) - 1, POSITIONS).astype(int)))
-    prior = lens_prior(some.size_px, interior[:, 0], network.fisheye).only("f", "k1")
-    for gate in (4 * WIDE_GATE, WIDE_GATE, GATE):
+    prior = replace(lens_prior(some.size_px, network.interior[:, 0], network.fisheye).only(*names), block=block)
+    for gate in gates:
         tolerance = gate * COARSE_CAUCHY_PX
         part = some if some.labelled else labelled_ends(network, some, tolerance)
         network, used = with_bars(network, part, tolerance)

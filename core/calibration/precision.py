@@ -131,6 +131,16 @@ def without_rigid_motion(D: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
     return (flat - T @ np.linalg.lstsq(T, flat, rcond=None)[0]).reshape(D.shape)
 
 
+def displaced(cameras: Sequence[Camera], unknowns: Unknowns, change: np.ndarray, xyz_m: np.ndarray) -> float:
+    """RMS distance [m] by which a change (C p,) of the camera unknowns moves points (M, 3), beyond a rigid motion.  (2), (3)"""
+    D = point_derivatives(cameras, unknowns, xyz_m)
+    keep = np.isfinite(D).all(axis=(1, 2))
+    if not keep.any():
+        return 0.0
+    moved = without_rigid_motion(D[keep], xyz_m[keep]) @ change
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+
 def predicted_error(cameras: Sequence[Camera], unknowns: Unknowns, covariance: np.ndarray, pairs_m: np.ndarray) -> PredictedError:
     """The error at the ends of test bars (K, 2, 3) from the cameras' covariance (C p, C p).
 

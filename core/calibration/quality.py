@@ -9,6 +9,7 @@
 Small residuals in the images prove nothing: they may hide errors a hundred times larger in space.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR, Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.robust import finite_median
-from .bundle import LevenbergMarquardt, adjust
+from .bundle import LevenbergMarquardt, Unknowns, adjust
 from .network import Network, Observations
 from .precision import PredictedError, predicted_error
 from .self_calibration import GROSS, Calibration
@@ -95,20 +96,23 @@ class Quality:
 
 def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     """The quality of a calibration, which should be in its final world frame."""
-    observations, network, used = calibration.observations, calibration.network, calibration.used
+    observations, network, used, other = calibration.observations, calibration.network, calibration.used, calibration.other
     cameras = network.cameras(observations.names, observations.size_px)
     points = network.points_m
     ends = points[used.any(axis=1)]
     box = np.percentile(ends, BOX_PERCENTILES, axis=0)
-    values, axes = np.linalg.eigh(_scatter(network, observations.measured(used)))
+    values, axes = _scatter(calibration)
     monitor.step("quality", 0, 3)
     held_out, untested = held_out_lengths(calibration)
     monitor.step("quality", 1, 3)
-    mirror = mirrored(calibration)
+    mirror = _least_mirrored(calibration)
     monitor.step("quality", 2, 3)
     count = np.maximum(used.sum(axis=(0, 2)), 1)
     square = np.sum(np.where(used[..., None], calibration.residual_px, 0.0) ** 2, axis=(0, 2, 3))
-    depth = [cameras[c].to_camera(points[used[:, c]])[:, 2] for c in range(len(cameras))]
+    depth = _depth_ratios(points, used, cameras)
+    if other is not None:
+        there = other.network.cameras(observations.names, observations.size_px)
+        depth = np.maximum(depth, _depth_ratios(other.network.points_m, other.used, there))
     both = observations.views(used).astype(int)
     tests = test_bars(box, observations.length_m)
     predicted = predicted_error(cameras, calibration.every_unknown, calibration.considered, tests)
@@ -119,13 +123,13 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
         visited=_visited(points[whole].reshape(-1, 3), box),
         seen_by_two=len(predicted.xyz_m) / (2 * len(tests)),
         rejected=int(((observations.views(observations.visible).sum(axis=1) >= 2) & ~whole).sum()),
-        used_lengths=_lengths(observations, used, cameras, np.ones(len(used), dtype=bool)),
+        used_lengths=lengths_of(observations, used, cameras, np.ones(len(used), dtype=bool)),
         held_out=held_out,
         held_out_untested=untested,
         scatter=values,
         missing_direction=axes[:, 0],
-        coverage=np.stack([_cells(observations.xy_px[:, c][used[:, c]], observations.size_px[c]) for c in range(len(cameras))]),
-        depth_ratio=np.array([_ratio(d) for d in depth]),
+        coverage=_coverage(calibration),
+        depth_ratio=depth,
         rms_px=np.sqrt(square / (2 * count)),
         shared=both.T @ both,
         mirror=mirror,
@@ -135,8 +139,28 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     return quality
 
 
-def _scatter(network: Network, measured: np.ndarray) -> np.ndarray:
-    return network.spread[measured].sum(axis=0) / max(int(measured.sum()), 1)
+def _scatter(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """The eigenvalues (3,) of the directions, ascending, and the axes (3, 3); of bar or board, whichever points into more directions."""
+    found = []
+    for part in (calibration, calibration.other):
+        if part is not None:
+            used = part.used
+            measured = part.observations.views(used).any(axis=1) if part is calibration.other else part.observations.measured(used)
+            values, axes = np.linalg.eigh(part.network.spread[measured].sum(axis=0) / max(int(measured.sum()), 1))
+            found.append((values, axes))
+    return max(found, key=lambda pair: float(pair[0][0]))
+
+
+def _coverage(calibration: Calibration) -> np.ndarray:
+    """(C, 6, 8) image points used in each cell."""
+    parts = [part for part in (calibration, calibration.other) if part is not None]
+    size = calibration.observations.size_px
+    each = [[_cells(part.observations.xy_px[:, c][part.used[:, c]], size[c]) for c in range(len(size))] for part in parts]
+    return np.sum(each, axis=0)
+
+
+def _depth_ratios(points_m: np.ndarray, used: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    return np.array([_ratio(camera.to_camera(points_m[used[:, c]])[:, 2]) for c, camera in enumerate(cameras)])
 
 
 def _ratio(depth: np.ndarray) -> float:
@@ -159,7 +183,7 @@ def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
     return np.stack([points, points + inward * length_m], axis=1)
 
 
-def _lengths(observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
+def lengths_of(observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
     """Lengths of the positions `which` (N,) from the image points `used` (N, C, K), each point intersected independently.  (1)"""
     pairs = observations.tested_pairs
     points = sorted({k for pair in pairs for k in pair[:2]})
@@ -198,10 +222,10 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
             iteration=LevenbergMarquardt(max_iterations=6, tolerance=1e-2),
         )
         cameras = done.network.cameras(observations.names, observations.size_px)
-        parts.append(_lengths(observations, calibration.used, cameras, out))
+        parts.append(lengths_of(observations, calibration.used, cameras, out))
         left = observations.part(out)
         meet = left.meeting(cameras, GROSS * calibration.sigma0_px)
-        untested.append(_lengths(left, meet, cameras, np.ones(len(meet), dtype=bool)))
+        untested.append(lengths_of(left, meet, cameras, np.ones(len(meet), dtype=bool)))
     return _together(parts), _together(untested)
 
 
@@ -214,20 +238,30 @@ def _together(parts: list[Lengths]) -> Lengths:
     )
 
 
-def mirrored(calibration: Calibration) -> float:
+def _least_mirrored(calibration: Calibration) -> float:
+    """That of the object which distinguishes better; lenses that a board gives are known."""
+    other, unknowns = calibration.other, calibration.unknowns.in_step.alone
+    focal = ("f",) if other is None else ()
+    found = mirrored(calibration.observations, calibration.network, calibration.used, unknowns, calibration.sigma0_px, focal)
+    if other is None or other.lenses_only:
+        return found
+    return max(found, mirrored(other.observations, other.network, other.used, unknowns, other.sigma_px, focal))
+
+
+def mirrored(
+    observations: Observations, network: Network, used: np.ndarray, unknowns: Unknowns, sigma: float, focal: Sequence[str] = ("f",)
+) -> float:
     """Sum of squares of the solution with reversed depth over that of this one: far above 1 where perspective distinguishes them.  (3)"""
-    some = np.unique(np.linspace(0, len(calibration.used) - 1, MIRROR_POSITIONS).astype(int))
-    part, used = calibration.observations.part(some), calibration.used[some]
-    network = calibration.network.at(some)
+    some = np.unique(np.linspace(0, len(used) - 1, MIRROR_POSITIONS).astype(int))
+    part, used, network = observations.part(some), used[some], network.at(some)
     middle = network.points_m[used.any(axis=1)].mean(axis=0)
     view = network.R[:, 2].mean(axis=0)
     view /= np.linalg.norm(view)
     H = np.eye(3) - 2 * np.outer(view, view)
     R = np.diag([1.0, 1.0, -1.0]) @ network.R @ H
     start = replace(network.transformed(H, middle - H @ middle), R=R, t=network.R @ middle + network.t - R @ middle)
-    unknowns, sigma = calibration.unknowns.in_step, calibration.sigma0_px
     other = adjust(
-        start, part.xy_px, used, unknowns.only("f"), unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0)
+        start, part.xy_px, used, unknowns.only(*focal), unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0)
     )
     this = adjust(network, part.xy_px, used, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=2))
     return other.cost / max(this.cost, 1e-12)

@@ -15,6 +15,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,8 @@ from .bundle import (
     residuals_of,
 )
 from .delays import MovingPoints, first_delays, in_order, moving_points, without_jumps
-from .fisheye_bar import fisheye_network
+from .fisheye_bar import fisheye_delays, fisheye_network
+from .helmert import Partial
 from .network import BarNetwork, Network, Observations
 from .precision import camera_covariance, group_of, with_left_out
 from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_prior
@@ -57,6 +59,16 @@ LEAST_DELAY = 0.01  # images: cameras that are less apart count as in step
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Alone:
+    """An adjustment without the other object, for comparison."""
+
+    network: Network
+    used: np.ndarray  # (N, C, K)
+    square_px2: float  # sum of the squares of the residuals
+    sigma0_px: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Calibration:
     """An adjusted network, and what its quality is judged by."""
 
@@ -73,6 +85,13 @@ class Calibration:
     converged: bool
     remarks: tuple[str, ...] = ()  # lines of the report
     doubt: str = ""  # why the cameras may be wrong although the figures are good
+    other: Partial | None = None  # another object that takes part
+    alone: Alone | None = None  # the adjustment without it
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What the objects were given as, for files."""
+        return {**self.observations.described, **({} if self.other is None else self.other.observations.described)}
 
     @property
     def delays(self) -> dict[str, tuple[float, float]]:
@@ -90,20 +109,43 @@ class Calibration:
         return replace(self.unknowns.in_step, free=np.ones(len(INTERIOR), dtype=bool))
 
 
+Start = Callable[[BarObservations], BarNetwork]  # the cameras, from nothing
+Delays = Callable[[BarObservations], np.ndarray]  # (C,) how late each camera is, roughly
+
+
 def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None, fisheye: bool = False) -> Calibration:
     """Calibrate the cameras from image points and the bar's length alone; `fisheye`: all of them have such lenses.
 
     Raises:
         InputError: the cameras share too few bars.
     """
+    if fisheye:
+        return calibrate_from(
+            lambda some: fisheye_network(some, focal_px).network, observations, monitor, lambda raw: fisheye_delays(raw, focal_px)
+        )
+    return calibrate_from(lambda some: initial_network(some, focal_px).network, observations, monitor, delays_of_bars)
+
+
+def delays_of_bars(bars: BarObservations) -> np.ndarray:
+    """How late each camera is (C,), if its lens keeps lines nearly straight."""
+    return first_delays(moving_points(bars.frames, bars.xy_px), bars.size_px, bars.labelled)
+
+
+def calibrate_from(
+    start: Start, observations: BarObservations, monitor: Monitor, delays: Delays, other: Partial | None = None
+) -> Calibration:
+    """Calibrate the cameras from the network that `start` finds and the first `delays`, together with another object if there is one.
+
+    Raises:
+        InputError: the cameras share too few bars.
+    """
     monitor.step("calibration", 0, 5)
     raw = without_jumps(observations.frames, observations.xy_px)
-    moving = moving_points(observations.frames, raw)
-    none = np.zeros(len(observations.names))  # the search needs lenses that keep lines nearly straight
-    late = none if fisheye else first_delays(moving, observations.size_px, observations.labelled)
-    done = _at_delays(observations, raw, late, monitor, focal_px, fisheye) if late.any() else None
+    none = np.zeros(len(observations.names))
+    late = delays(observations.changed(raw, labelled=observations.labelled))
+    done = _at_delays(start, observations, raw, late, monitor, other) if late.any() else None
     if done is None or not _convincing(done):
-        at_once = _at_delays(observations, raw, none, monitor, focal_px, fisheye)
+        at_once = _at_delays(start, observations, raw, none, monitor, other)
         assert at_once is not None
         done = at_once if done is None or at_once.used.sum() > done.used.sum() else done
     return done
@@ -116,19 +158,20 @@ def _convincing(found: Calibration) -> bool:
 
 
 def _at_delays(
-    observations: BarObservations, raw_px: np.ndarray, late_images: np.ndarray, monitor: Monitor, focal_px: float | None, fisheye: bool
+    start: Start, observations: BarObservations, raw_px: np.ndarray, late_images: np.ndarray, monitor: Monitor, other: Partial | None
 ) -> Calibration | None:
     """The calibration that starts from delays (C,); None if these are not 0 and turn out not to be significant: they moved the points."""
     moving = moving_points(observations.frames, raw_px)
     if late_images.any():
         observations = observations.changed(moving.at(late_images)[0], labelled=observations.labelled)
-    start = (fisheye_network if fisheye else initial_network)(observations, focal_px)
+    network = start(observations)
     monitor.step("calibration", 1, 5)
-    network, labelled, sigma = refined_start(start.network, observations)
+    network, labelled, sigma = refined_start(network, observations, other)
     monitor.step("calibration", 2, 5)
-    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
-    first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
+    first = coarse_adjustment(network, labelled.xy_px, used, _prior(observations, network, other), sigma)
+    other = None if other is None else other.at(first.network)
+    prior = _prior(observations, network, other)
     monitor.step("calibration", 3, 5)
     ordered = in_order(raw_px, observations.xy_px, labelled.xy_px, late_images)
     points = moving_points(labelled.frames, without_jumps(labelled.frames, ordered), late_images)
@@ -137,14 +180,23 @@ def _at_delays(
         return with_bars(bars, labelled if bars.delay_images is None else labelled.changed(points.at(bars.delay_images)[0]), tolerance_px)
 
     delayed = with_delays(first, points, prior, sigma, again)
-    if delayed is not None:
-        first, used = delayed
-        tested = without_outliers(first, labelled, used, _with_delays(prior, points), again, points)
-        return without_insignificant(*tested, labelled, monitor, points)
-    if late_images.any():
+    if delayed is None and late_images.any():
         return None
-    tested = without_outliers(first, labelled, used, prior, again)
-    return without_insignificant(*tested, labelled, monitor)
+    moved = None if delayed is None else points
+    first, used = delayed or (first, used)
+    tested = without_outliers(first, labelled, used, _with_delays(prior, moved), again, moved)
+    done = without_insignificant(*tested, labelled, monitor, moved, other)
+    if other is None:
+        return done
+    state, keep, sigma, _ = without_outliers(tested[0], labelled, tested[1], _with_delays(prior.alone, moved), again, moved)
+    square = float(np.sum(state.residual_px[keep] ** 2))
+    return replace(done, alone=Alone(network=state.network, used=keep, square_px2=square, sigma0_px=sigma))
+
+
+def _prior(observations: Observations, network: Network, other: Partial | None) -> Unknowns:
+    """The prior of the cameras with all unknowns free, and what another object contributes."""
+    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
+    return prior if other is None else replace(prior, block=other.block)
 
 
 def with_delays(
@@ -186,9 +238,11 @@ def coarse_adjustment(network: AnyNetwork, xy_px: np.ndarray, used: np.ndarray, 
     return adjust(network, xy_px, used, prior, cauchy_px=3 * sigma_px, unit_px=sigma_px, iteration=iteration)
 
 
-def refined_start(network: BarNetwork, observations: BarObservations) -> tuple[BarNetwork, BarObservations, float]:
+def refined_start(
+    network: BarNetwork, observations: BarObservations, other: Partial | None = None
+) -> tuple[BarNetwork, BarObservations, float]:
     """The cameras, adjusted with all unknowns on a part of the positions; all observations with their ends in order; sigma [px]."""
-    prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
+    prior = _prior(observations, network, other)
     some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
     cauchy = COARSE_CAUCHY_PX
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):
@@ -293,9 +347,10 @@ def without_insignificant(
     observations: Observations,
     monitor: Monitor,
     points: MovingPoints | None = None,
+    other: Partial | None = None,
 ) -> Calibration:
     """Leave out the groups of lens parameters that are not significant, with a new adjustment after each.  (3)"""
-    unknowns = _with_delays(lens_prior(observations.size_px, state.network.interior[:, 0], state.network.fisheye), points)
+    unknowns = _with_delays(_prior(observations, state.network, other), points)
     decisions: list[str] = []
     first, all_free = state.network, unknowns
     covariance = _covariance(state, keep, unknowns, sigma, points)
@@ -314,6 +369,11 @@ def without_insignificant(
         iteration = LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
         state = adjust(fixed, points or observations.xy_px, keep, unknowns, unit_px=sigma, iteration=iteration)
         covariance = _covariance(state, keep, unknowns, sigma, points)
+    if other is not None:  # its equations, formed again at the result
+        other = other.at(state.network)
+        unknowns = replace(unknowns, block=other.block)
+        state = adjust(state.network, points or observations.xy_px, keep, unknowns, unit_px=sigma)
+        other = other.at(state.network)
     monitor.step("calibration", 5, 5)
     square = float(np.sum(state.residual_px[keep] ** 2))
     sigma = float(np.sqrt(square / redundancy))
@@ -334,6 +394,7 @@ def without_insignificant(
         ),
         decisions=tuple(decisions),
         converged=state.converged,
+        other=other,
     )
 
 

@@ -141,12 +141,20 @@ def advice(calibration: Calibration, quality: Quality) -> str:
     good, words = calibration.observations.good_positions, _words(calibration)
     improvements = [
         (quality.scatter[0] / GOOD_SCATTER, _tilt(calibration, quality)),
-        (used / good, words["more"].format(used=used, good=good)),
+        (used / good + _positions_of_other(calibration), words["more"].format(used=used, good=good)),
         ((quality.depth_ratio.min() - 1) / (GOOD_DEPTH - 1), words["deeper"]),
         (quality.covered[worst] / GOOD_COVERAGE, words["there"].format(side=_empty_side(quality.coverage[worst]), camera=names[worst])),
     ]
     urgency, text = min(improvements, key=lambda entry: entry[0])
     return text if urgency < 1 else "nothing needs to be improved; more positions would reduce the error further"
+
+
+def _positions_of_other(calibration: Calibration) -> float:
+    """The positions of another object that takes part, relative to a good number."""
+    if calibration.other is None:
+        return 0.0
+    seen, observations = calibration.other.used, calibration.other.observations
+    return float(observations.views(seen).any(axis=1).sum()) / observations.good_positions
 
 
 def _mm(metres: float) -> str:

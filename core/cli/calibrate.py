@@ -5,14 +5,16 @@ import json
 import re
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from ..calibration import report
 from ..calibration.bars import BarObservations
 from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
-from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, open_boards, write_report
+from ..calibration.calibrate import Start, Starts, calibrate_rig, measure_bar, open_bar, open_boards, write_report
 from ..calibration.rig_files import read_any, write_as
+from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -44,11 +46,23 @@ def _board(args: argparse.Namespace) -> Board | None:
     if args.board is None:
         if args.squares or args.square or args.marker or args.printed:
             raise InputError("--squares, --square, --marker and --print describe a board; give --board chessboard or --board charuco, too.")
-        return None
+        if args.with_board is not None:
+            raise InputError("--with-board needs the board; give --board chessboard or --board charuco, --squares and --square.")
+    if args.lenses_only and args.with_board is None:
+        raise InputError("--lenses-only belongs to --with-board, the folder of the films of the board.")
+    return None if args.board is None else _described(args)
+
+
+def _described(args: argparse.Namespace) -> Board:
+    """The board of --board.
+
+    Raises:
+        InputError: its description is faulty, or options of a bar were given without a bar.
+    """
     for given, flag in ((args.bar_length, "--bar-length"), (args.target_diameter, "--target-diameter"), (args.mask, "--mask")):
-        if given is not None:
+        if given is not None and args.with_board is None:
             raise InputError(f"{flag} belongs to a bar, and --board was given; leave one of them out.")
-    if args.interlaced != "none":
+    if args.interlaced != "none" and args.with_board is None:
         raise InputError("Boards are measured in whole images; leave out --interlaced, or calibrate interlaced cameras with a bar.")
     numbers = re.fullmatch(r"(\d{1,3})[x×](\d{1,3})", args.squares or "")
     if numbers is None or args.square is None:
@@ -85,7 +99,7 @@ def _convert(args: argparse.Namespace) -> list[str]:
 
 
 def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> list[str]:
-    if board is None and args.bar_length is None:
+    if (board is None or args.with_board is not None) and args.bar_length is None:
         raise InputError(
             "The bar's length is missing; give --bar-length with the distance between its two targets in metres, or --board with --squares "
             "and --square."
@@ -103,7 +117,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         write_as(args.out, result.rig, args.format)
     else:
         write_rig(args.out, result.rig)
-        if board is None:
+        if isinstance(result.calibration.observations, BarObservations):
             written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
         return [json.dumps(report.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
@@ -117,24 +131,39 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
     ]
 
 
-def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> BarObservations | BoardObservations:
-    firsts = None if args.synchronise is None else partial(_first_images, args, monitor)
-    if board is not None:
-        return measure_boards(open_boards(args.bar, firsts), board, monitor)
-    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field, firsts)
-    return measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations
+def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> BarObservations | BoardObservations | BarAndBoard:
+    starts = _starts(args, monitor, args.bar)
+    if board is not None and args.with_board is None:
+        return measure_boards(open_boards(args.bar, starts), board, monitor)
+    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field, starts)
+    if board is None:
+        return measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations
+    boards = open_boards(args.with_board, _starts(args, monitor, args.with_board), together=not args.lenses_only)
+    check_names(footage.names, boards.names)
+    return BarAndBoard(
+        bars=measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations,
+        boards=measure_boards(boards, board, monitor),
+        lenses_only=args.lenses_only,
+    )
 
 
-def _first_images(
-    args: argparse.Namespace, monitor: Monitor, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]
-) -> tuple[int, ...]:
-    from ..synchronising.bar_and_board import first_images
+def _starts(args: argparse.Namespace, monitor: Monitor, folder: Path) -> Starts | None:
+    """Finds what belongs together in the films of a folder; None where images of the same number do."""
+    if args.synchronise is not None and args.rates is not None:
+        raise InputError("Give the rates with --synchronise, such as --synchronise L=24,C=30,R=60, or with --rates, not with both.")
+    return None if args.synchronise is None and args.rates is None else partial(_start, args, monitor, folder)
 
-    if not 0.1 <= args.synchronise <= 10_000:
-        raise InputError(f"--synchronise is {args.synchronise:g}; give the images per second of all views, such as 30.")
-    firsts, timings = first_images(args.bar, names, sequences, args.synchronise, monitor, args.movie_sound)
-    args.started = [str(timing) for timing in timings]
-    return firsts
+
+def _start(args: argparse.Namespace, monitor: Monitor, folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> Start:
+    from ..synchronising.bar_and_board import common_start
+
+    if args.rates is not None and "=" not in args.rates:
+        raise InputError(f"--rates is {args.rates}; give the images per second of each view, such as L=24,C=30,R=60.")
+    by_sound = args.synchronise is not None
+    rates = str(args.synchronise if by_sound else args.rates)
+    start, timings = common_start(folder, names, sequences, rates, monitor, args.movie_sound, by_sound)
+    args.started = [*args.started, *(str(timing) for timing in timings)]
+    return start
 
 
 def _world(args: argparse.Namespace) -> WorldChoice:

@@ -158,6 +158,10 @@ def _calibrate(commands: Any) -> None:
     parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the rig to write, such as rig.toml")
     parser.add_argument("--board", choices=BOARDS, help="the images show a board instead of a bar")
+    about = "with --bar-length: a folder like BARDIR of the board, filmed by the same cameras; both go into one adjustment"
+    parser.add_argument("--with-board", type=Path, metavar="DIR", help=about)
+    about = "with --with-board: the cameras were moved between the films, or filmed the board one after another; it gives their lenses only"
+    parser.add_argument("--lenses-only", action="store_true", help=about)
     parser.add_argument("--squares", metavar="9x6", help="across and down: inner corners of a chessboard, squares of a ChArUco board")
     parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
     parser.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
@@ -165,8 +169,11 @@ def _calibrate(commands: Any) -> None:
     about = "the model of the lenses; auto: the one that fits the images, with a board that of each camera"
     parser.add_argument("--lens", choices=LENSES, default="auto", help=about)
     parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")
-    about = "images per second; finds when each view began: by sound (NAME.wav; in Blender the movie's own), light or time codes"
-    parser.add_argument("--synchronise", type=float, metavar="F", help=about)
+    about = "images per second (30, or L=24,C=30,R=60); finds when each view began: by sound (NAME.wav; in Blender the movie's), light, …"
+    parser.add_argument("--synchronise", metavar="F", help=about)
+    parser.add_argument(
+        "--rates", metavar="L=24,…", help="images per second of each view, if they differ, of films that begin at the same instant"
+    )
     parser.set_defaults(movie_sound=None, started=[])  # the add-on's command reads that of movies
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument(

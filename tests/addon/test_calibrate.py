@@ -14,11 +14,12 @@ from tricap.core.synthetic.bar import BarNoise, BarPictures, benchmark_cameras, 
 from tricap.core.synthetic.board import held_board, picture_of_board
 from tricap.core.take.bar_file import read_bar
 
+from ..core.calibration.test_boards import filmed
 from ..core.synchronising.test_synchronise import heard, world, write_wav
 from .conftest import small_rig
 from .layout import Layout
 
-FRAMES = 24
+FRAMES = 30
 ADDON = "bl_ext.user_default.tricap.addon"
 
 
@@ -72,6 +73,21 @@ def test_cameras_that_were_started_one_by_one(blender, empty, bar: Path, tmp_pat
     assert min(places.values()) > 20
 
 
+def test_cameras_at_different_rates(blender, empty, bar: Path, tmp_path: Path) -> None:
+    """L takes every second image of the others."""
+    for view in "LCR":
+        (tmp_path / "mixed" / view).mkdir(parents=True)
+        for n, file in enumerate(sorted((bar / view).glob("*.png"))[:: 2 if view == "L" else 1]):
+            (tmp_path / "mixed" / view / f"{n:04d}.png").symlink_to(file)
+    props = empty.context.scene.tricap_calibrate
+    props.bar, props.length_m, props.rates = str(tmp_path / "mixed"), 0.5, "L=12.5, C=25"
+    with pytest.raises(RuntimeError, match="lacks the view R"):
+        empty.ops.tricap.calibrate()
+    props.rates = "L=12.5, C=25, R=25"
+    assert empty.ops.tricap.calibrate() == {"FINISHED"}
+    assert read_rig(tmp_path / "rig.toml").metadata["positions"] <= FRAMES // 2
+
+
 def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_path: Path) -> None:
     """The bar stands in both fields of these images, so twice as many frames are measured as the clip has."""
     props = empty.context.scene.tricap_calibrate
@@ -82,6 +98,28 @@ def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_pat
     track = empty.data.movieclips["Bar C"].tracking.tracks[0].markers
     assert FRAMES // 2 < len(track) <= FRAMES + 1 and max(m.frame for m in track) <= FRAMES + 1
     assert len(empty.data.objects["Reference bar"].data.vertices) <= 2 * FRAMES
+
+
+def test_a_board_beside_the_wand(blender, empty, bar: Path, tmp_path: Path) -> None:
+    board = Board(kind=BoardKind.CHESSBOARD, squares=(9, 6), square_m=0.05)
+    filmed(tmp_path / "board", board, benchmark_cameras(), 5)
+    panel, props = importlib.import_module(f"{ADDON}.calibrate.panel"), empty.context.scene.tricap_calibrate
+    props.bar, props.length_m = str(bar), 0.5
+    drawn = Layout()
+    panel.draw_calibrate(drawn, empty.context)
+    assert "board_footage" in drawn.properties and "squares" not in drawn.properties
+    props.board_footage, props.board_kind, props.squares, props.square_m = str(tmp_path / "board"), "chessboard", (9, 6), 0.05
+    props.lenses_only = True
+    assert empty.ops.tricap.calibrate(out=str(tmp_path / "rig.toml")) == {"FINISHED"}
+    assert "give the lenses only" in (tmp_path / "rig_report" / "calibration.txt").read_text(encoding="utf-8")
+    assert read_rig(tmp_path / "rig.toml").metadata["square_m"] == 0.05 and (tmp_path / "rig_bar.csv").exists()
+    drawn = Layout()
+    panel.draw_calibrate(drawn, empty.context)
+    assert {"board_kind", "squares", "lenses_only"} <= set(drawn.properties)
+    assert any("L: 4 of 4 images show the board" in text for text in drawn.texts), drawn.texts
+    (tmp_path / "board" / "R").rename(tmp_path / "board" / "X")
+    with pytest.raises(RuntimeError, match="name the folders or movies of both like the cameras"):
+        empty.ops.tricap.calibrate()
 
 
 def test_a_mistake_is_told_and_changes_nothing(blender, empty, tmp_path: Path) -> None:

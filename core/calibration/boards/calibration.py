@@ -19,8 +19,9 @@ from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...geometry.camera import INTERIOR, image_with_derivatives
 from ...geometry.robust import masked_median
-from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
+from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, residuals
 from ..delays import MovingPoints, PlacedPoints, first_delays, moving_points, placed_points
+from ..helmert import positioned
 from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
 from ..self_calibration import GROSS, Calibration, coarse_adjustment, robust_sigma, with_delays, without_insignificant, without_outliers
@@ -36,14 +37,14 @@ FEW_TOGETHER = 0.25  # of the images in which a camera does not agree: those in 
 MANY_APART = 0.25  # of the images of a camera
 LONG_RUN = 3  # images one after another in which a camera does not agree: it was moved or exchanged
 FEWEST_SIDE = 3  # views before and after a camera was moved
-STEP_T = 6.0  # Student's t of its residuals, the largest of all frames
+STEP_T = 5.0  # Student's t of its residuals, the largest of all frames
 STEP_PART = 0.3  # of sigma0 by which they must change
-CLEAR_T, CLEAR_PART = 4.0, 0.75  # the same for a large change, which few views support
+CLEAR_T, CLEAR_PART = 4.0, 0.6  # the same for a large change, which few views support
 MOST_LISTED = 8  # frames
 BENT = 0.004  # of the diagonal
 STRETCHED = 1e-3  # makes the scale uncertain by half of it, the limit of a good calibration
-POSE_STEPS = 8  # of positions with the cameras fixed
 APART = 2.5  # times the median residual of views with positions of their own: a view beyond it does not fit the others of its position
+LEAST_APART_PX = 0.05  # no corner is located better in a real image
 APART_SHARED = 2.0  # times that of views with shared positions, which contains the errors of the lens and of slight asynchrony
 
 
@@ -91,7 +92,7 @@ def _first_adjustment(
         observations = observations.changed(moving.at(moving.expected_images)[0])
     started = initial_network(observations, lenses)
     monitor.step("calibration", 1, 5)
-    network, sigma = _refined(started.network, started.observations, monitor)
+    network, sigma = refined(started.network, started.observations, monitor)
     network, labelled = split_apart(network, started.observations, sigma)
     monitor.step("calibration", 2, 5)
     prior = lens_prior(labelled.size_px, network.interior[:, 0], network.fisheye)
@@ -217,11 +218,18 @@ def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], list[str]
             if len(run) >= LONG_RUN:
                 where += f", among them all from {run[0]} to {run[-1]}"
             doubts.append(f"camera {name}, moved, exchanged or not synchronised, disagrees with the others {where}")
-    some = len(np.unique(apart[:, 0]))
-    pairs = sum(views[labelled.frames == frame].sum() >= 2 for frame in np.unique(labelled.frames))
-    if not doubts and some > MANY_APART * pairs:  # shared out among the cameras
-        doubts.append(f"the cameras disagree in {some} of {pairs} images; was one of them moved, exchanged or not synchronised?")
-    return lines, doubts
+    return lines, doubts or _shared_out(labelled, apart)
+
+
+def _shared_out(labelled: BoardObservations, apart: np.ndarray) -> list[str]:
+    """The doubt that disagreements raise of which no camera has many: with two cameras, either may be the wrong one."""
+    views = labelled.views(labelled.visible)
+    shared = np.array([frame for frame in np.unique(labelled.frames) if views[labelled.frames == frame].sum() >= 2])
+    some, run = len(np.unique(apart[:, 0])), _longest_run(shared, apart[:, 0])
+    if some <= MANY_APART * len(shared) and len(run) < LONG_RUN:
+        return []
+    where = f"in {some} of {len(shared)} images" + (f", among them all from {run[0]} to {run[-1]}" if len(run) >= LONG_RUN else "")
+    return [f"the cameras disagree {where}; was one of them moved, exchanged or not synchronised?"]
 
 
 def _longest_run(shown: np.ndarray, apart: np.ndarray) -> np.ndarray:
@@ -323,7 +331,7 @@ def _apart(labelled: BoardObservations) -> np.ndarray:
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-def _refined(network: BoardNetwork, observations: BoardObservations, monitor: Monitor) -> tuple[BoardNetwork, float]:
+def refined(network: BoardNetwork, observations: BoardObservations, monitor: Monitor) -> tuple[BoardNetwork, float]:
     """Robust adjustment with more and more unknowns; sigma [px]."""
     prior = lens_prior(observations.size_px, network.interior[:, 0], network.fisheye)
     cauchy, sigma = COARSE_CAUCHY_PX, 1.0
@@ -336,18 +344,6 @@ def _refined(network: BoardNetwork, observations: BoardObservations, monitor: Mo
         network, sigma = done.network, robust_sigma(done.residual_px, observations.visible)
         cauchy = float(np.clip(3 * sigma, 0.3, cauchy))
     return network, sigma
-
-
-def positioned(network: BoardNetwork, xy_px: np.ndarray, used: np.ndarray, cauchy_px: float) -> BoardNetwork:
-    """The positions adjusted robustly with the cameras fixed (Gauss–Newton)."""
-    none = Unknowns(free=np.zeros(len(INTERIOR), dtype=bool), expected=network.interior, sigma=np.ones_like(network.interior))
-    for _ in range(POSE_STEPS):
-        v = residuals(network, xy_px)
-        weight, _ = weights_of(v, cauchy_px, used)
-        normals = normal_equations(network, v, weight, none, 1.0)
-        inverse = inverse_factors(normals.U)
-        network = network.stepped(np.einsum("jkn,jn->kn", inverse, np.einsum("jkn,kn->jn", inverse, normals.g_b)))
-    return network
 
 
 def with_boards(network: BoardNetwork, observations: BoardObservations, tolerance_px: float) -> tuple[BoardNetwork, np.ndarray]:
@@ -398,7 +394,7 @@ def _limit_px(network: BoardNetwork, observations: BoardObservations, cauchy_px:
     alone[np.arange(len(views)), views[:, 1]] = observations.xy_px[views[:, 0], views[:, 1]]
     single = observations.changed(alone, observations.frames[views[:, 0]])
     own = view_residuals(positioned(network.at(views[:, 0]), alone, single.visible, cauchy_px), single)
-    return max(APART * float(np.median(own[np.arange(len(views)), views[:, 1]])), APART_SHARED * together)
+    return max(APART * float(np.median(own[np.arange(len(views)), views[:, 1]])), APART_SHARED * together, LEAST_APART_PX)
 
 
 def _moved_apart(

@@ -10,8 +10,9 @@ import numpy as np
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...images.sequence import ImageFiles, ImageSequence
+from ..clocks import Clocks, corners_at_common_instants
 from .board import DICTIONARIES, Board, BoardKind
-from .detection import MIRRORED, VARIANTS, Variant, find_corners, find_variant
+from .detection import FEWEST_CORNERS, MIRRORED, VARIANTS, Variant, find_corners, find_variant
 from .observations import BoardObservations
 
 Note = Callable[[str, int, int], None]  # view, images searched, images with the board
@@ -32,14 +33,20 @@ class BoardFootage:
     names: tuple[str, ...]
     sequences: tuple[ImageSequence, ...]
     numbers: tuple[np.ndarray, ...]  # (count,) of each
+    clocks: Clocks | None = None  # of films at different rates
 
 
-def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> BoardFootage:
+def numbered(
+    folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...], together: bool = True, clocks: Clocks | None = None
+) -> BoardFootage:
     """Images with their numbers: those in the names of the files, or their order where the names have none.
 
     Raises:
-        InputError: movies have different lengths, or no image belongs to another one.
+        InputError: movies that were taken `together` have different lengths.
     """
+    if not together or clocks is not None:
+        own = tuple(np.arange(s.count) for s in sequences)
+        return BoardFootage(folder=folder, names=names, sequences=sequences, numbers=own, clocks=clocks)
     numbers = [_numbers(s) for s in sequences]
     if any(n is None for n in numbers):
         counts = {name: s.count for name, s in zip(names, sequences)}
@@ -83,6 +90,8 @@ def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: 
             _refuse(footage, c, wanted, board)
         found.append(corners)
         sizes.append(size)
+    if footage.clocks is not None:
+        found = corners_at_common_instants(footage.clocks, found, board.symmetries)
     frames = _chosen(found)
     K = len(board.corners_m)
     xy = np.full((len(frames), len(found), K, 2), np.nan)
@@ -93,19 +102,21 @@ def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: 
     return BoardObservations(names=footage.names, size_px=np.array(sizes, dtype=float), xy_px=xy, frames=np.array(frames), board=board)
 
 
-def _wanted(footage: BoardFootage) -> np.ndarray:
-    """The numbers of the images that are searched."""
-    every = np.unique(np.concatenate(footage.numbers))
-    return every[_even(every, MOST_IMAGES)]
+def _wanted(footage: BoardFootage) -> list[np.ndarray]:
+    """The numbers of the images of each view that are searched."""
+    clocks = footage.clocks
+    every = np.unique(np.concatenate(footage.numbers)) if clocks is None else footage.numbers[clocks.slowest]
+    some = every[_even(every, MOST_IMAGES)]
+    return [some if clocks is None else clocks.around(c, some) for c in range(len(footage.names))]
 
 
-def _variant(footage: BoardFootage, wanted: np.ndarray, board: Board, monitor: Monitor) -> Variant:
+def _variant(footage: BoardFootage, wanted: list[np.ndarray], board: Board, monitor: Monitor) -> Variant:
     """How the board looks, from some images of each view; a chessboard looks the same inverted."""
     if board.kind is BoardKind.CHESSBOARD:
         return Variant()
     images: list[np.ndarray] = []
     for c in range(len(footage.names)):
-        at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+        at = np.flatnonzero(np.isin(footage.numbers[c], wanted[c]))
         for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]:
             monitor.step("board", len(images), TRIED_IMAGES * len(footage.names))
             images.append(footage.sequences[c].read(int(i)))
@@ -113,11 +124,11 @@ def _variant(footage: BoardFootage, wanted: np.ndarray, board: Board, monitor: M
 
 
 def _view(
-    footage: BoardFootage, c: int, wanted: np.ndarray, board: Board, variant: Variant, monitor: Monitor, note: Note | None
+    footage: BoardFootage, c: int, wanted: list[np.ndarray], board: Board, variant: Variant, monitor: Monitor, note: Note | None
 ) -> tuple[dict[int, np.ndarray], tuple[int, int]]:
     """The corners by image number of one view, and the size of its images."""
     name, sequence = footage.names[c], footage.sequences[c]
-    at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+    at = np.flatnonzero(np.isin(footage.numbers[c], wanted[c]))
     thorough = len(at) <= MOST_STILLS
     corners: dict[int, np.ndarray] = {}
     size = (0, 0)
@@ -159,9 +170,9 @@ def _even(numbers: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([np.arange(0), *(runs[i] for i in some)])[: max(count, 0)]
 
 
-def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> None:
+def _refuse(footage: BoardFootage, c: int, wanted: list[np.ndarray], board: Board) -> None:
     """Say why a view never shows the board."""
-    at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+    at = np.flatnonzero(np.isin(footage.numbers[c], wanted[c]))
     images = [footage.sequences[c].read(int(i)) for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]]
     start = f"View {footage.names[c]} in {footage.folder} never shows the {board.kind.value} of {board.label}"
     counted = "inner corners" if board.kind is BoardKind.CHESSBOARD else "squares"
@@ -172,6 +183,8 @@ def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> 
         for other in DICTIONARIES:
             if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:2])[1]:
                 raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
+        if (other_size := _other_charuco(images, board)) is not None:
+            raise InputError(f"{start} squares, but one of {other_size.label}; give {other_size.label}.")
     elif (other_size := _other_size(images[:: max(1, len(images) // GUESSED_IMAGES)], board)) is not None:
         raise InputError(
             f"{start} {counted}, but one of {other_size.label}: inner corners are where four squares meet; give {other_size.label}."
@@ -191,6 +204,20 @@ def _other_size(images: list[np.ndarray], board: Board) -> Board | None:
         if any(np.isfinite(find_corners(image, guess)).any() for image in images):
             return guess
     return None
+
+
+def _other_charuco(images: list[np.ndarray], board: Board) -> Board | None:
+    """The ChArUco board of another size that most corners in the images belong to: across and down exchanged, or miscounted."""
+    across, down = board.squares
+    found: list[tuple[int, Board]] = []
+    for size in ((down, across), *((across + a, down + d) for a, d in NEAR_SIZES)):
+        try:
+            guess = Board(kind=board.kind, squares=size, square_m=board.square_m, dictionary=board.dictionary, marker_m=board.marker_m)
+        except InputError:  # too few corners, or markers
+            continue
+        found.append((find_variant(images, guess, VARIANTS[:2])[1], guess))
+    count, best = max(found, key=lambda pair: pair[0], default=(0, board))
+    return best if count >= FEWEST_CORNERS else None
 
 
 def _other_markers(board: Board, dictionary: str) -> Board | None:

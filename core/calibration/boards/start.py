@@ -140,7 +140,7 @@ def _lens(one: BoardObservations, focal_px: float | None, fisheye: bool, whole: 
     interior = np.zeros(len(INTERIOR))
     interior[:4] = best[1], (width - 1) / 2, (height - 1) / 2, best[2] / (float(one.size_px[0] @ one.size_px[0]) / 4 / best[1] ** 2)
     more = one.part(_spread(one, LENS_POSITIONS))
-    network = _single(more, interior, fisheye)
+    network = single_camera(more, interior, fisheye)
     prior = lens_prior(more.size_px, network.interior[:, 0], network.fisheye)
     cost = np.inf
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2"), ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2"))[: 3 if whole else 2]:
@@ -159,7 +159,7 @@ def _flat(angles: np.ndarray) -> np.ndarray:
     return np.asarray(angles * np.where(theta > 1e-9, np.tan(near) / np.maximum(theta, 1e-9), 1.0))
 
 
-def _single(one: BoardObservations, interior: np.ndarray, fisheye: bool) -> BoardNetwork:
+def single_camera(one: BoardObservations, interior: np.ndarray, fisheye: bool) -> BoardNetwork:
     """One camera at the origin with its positions of the board."""
     network = BoardNetwork(
         interior=interior[None], R=np.eye(3)[None], t=np.zeros((1, 3)), fisheye=np.array([fisheye]), corners_m=one.board.corners_m,

@@ -189,6 +189,24 @@ def test_two_cameras_that_disagree_are_never_good() -> None:
     assert done.verdict.light != "green" and "the cameras disagree in 8 of 24 images" in done.verdict.sentence
 
 
+def test_two_cameras_that_disagree_in_a_row_are_never_good() -> None:
+    """Exchanged in five images one after another: neither of them has three of these, and together they are less than a quarter."""
+    rng = np.random.default_rng(14)
+    held = held_board(random_cameras(rng, "parallel")[:2], CHESSBOARD.corners_m, 24, rng, sigma_px=0.1)
+    xy = held.xy_px.copy()
+    for n in range(5):
+        xy[n, n % 2] += [12.0, 20.0]
+    done = calibrate_rig(observed(replace(held, xy_px=xy)), Monitor())
+    assert done.verdict.light != "green" and "among them all from 0 to 4" in done.verdict.sentence
+
+
+def test_views_that_fit_to_a_hundredth_of_a_pixel_are_synchronised() -> None:
+    held = drawn(6, sigma_px=0.002)
+    xy = held.xy_px.copy()
+    xy[3, 1] += 0.02
+    assert not calibrate_rig(observed(replace(held, xy_px=xy)), Monitor()).calibration.remarks
+
+
 def test_cameras_exchanged_towards_the_end_are_never_good() -> None:
     held = drawn(3, sigma_px=0.1)
     xy = held.xy_px.copy()
@@ -344,6 +362,13 @@ def test_images_without_a_board_are_refused(tmp_path: Path, capsys: pytest.Captu
         == 2
     )
     assert "View L" in (shown := capsys.readouterr().err) and "never shows the chessboard of 9×6 inner corners" in shown
+
+
+def test_a_charuco_board_whose_sides_were_exchanged_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    filmed(tmp_path / "board", CHARUCO, tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2]), 4)
+    described = ["--board", "charuco", "--squares", "4x5", "--square", "0.14", "--dictionary", "DICT_5X5_100"]
+    assert main(["calibrate", str(tmp_path / "board"), *described, "--out", str(tmp_path / "rig.toml")]) == 2
+    assert "but one of 5×4; give 5×4" in capsys.readouterr().err
 
 
 def test_a_board_whose_squares_were_counted_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,7 +40,7 @@ def by_sound(folder: Path, fps: float, names: tuple[str, ...], sequences: tuple[
 def test_images_that_were_taken_at_once_belong_together(films: Path) -> None:
     with pytest.raises(InputError, match="different numbers of frames"):
         open_bar(films)
-    bar, boards = (opened(films, firsts=partial(by_sound, films, 30.0)) for opened in (open_bar, open_boards))
+    bar, boards = (opened(films, starts=partial(by_sound, films, 30.0)) for opened in (open_bar, open_boards))
     for sequences in (bar.sequences, boards.sequences):
         assert [s.count for s in sequences] == [24, 24, 24]
         assert all(int(s.read(n)[0, 0]) == 116 + n for s in sequences for n in (0, 23))
@@ -51,7 +51,7 @@ def test_images_that_were_taken_at_once_belong_together(films: Path) -> None:
 def test_what_cannot_be_brought_together_is_told_in_one_sentence(films: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     described = ["--bar-length", "0.5", "--out", str(tmp_path / "rig.toml")]
     assert main(["calibrate", str(films), *described, "--synchronise", "0"]) == 2
-    assert "--synchronise is 0; give the images per second" in capsys.readouterr().err
+    assert "“0” is no frame rate; give the images per second" in capsys.readouterr().err
     assert main(["calibrate", str(films), *described, "--synchronise", "1000"]) == 2
     assert "ended before another view began" in capsys.readouterr().err
     for view in START_S:
