@@ -106,6 +106,22 @@ def test_films_that_contradict_each_other_are_never_good(spoil: str, said: str) 
     assert done.verdict.light != "green" and said in done.verdict.sentence
 
 
+@pytest.mark.parametrize(
+    ("turn", "zoom", "message"),
+    [
+        (0.0, 1.02, r"which is useless; the bar and the board do not fit the same cameras .* between the films\?$"),
+        (0.03, 1.0, r"only 0 of .* moved between the films"),
+    ],
+)
+def test_films_of_quite_different_cameras_are_refused_with_the_reason(turn: float, zoom: float, message: str) -> None:
+    cameras = benchmark_cameras()
+    R = rotation_from_vector(np.array([turn, 0.0, turn / 3])) @ cameras[2].R_cam_world
+    other = replace(cameras[2], R_cam_world=R, matrix=cameras[2].matrix * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]]))
+    waved, held = films(5, cameras, (*cameras[:2], other), bars=100)
+    with pytest.raises(InputError, match=message):
+        calibrated(waved, test_boards.observed(held))
+
+
 def test_lengths_that_no_rig_fits_are_refused() -> None:
     waved, held = films(6, benchmark_cameras(), benchmark_cameras())
     with pytest.raises(InputError, match="The bar measures 0.95.. times its given length"):
