@@ -187,5 +187,6 @@ def test_the_command_calibrates_with_both(tmp_path: Path, capsys: pytest.Capture
         ([*bar, *board[:2]], "--with-board needs the board"),
         ([*bar, "--lenses-only"], "--lenses-only belongs to --with-board"),
         ([*bar[:2], *bar[4:], *board], "The bar's length is missing"),
+        ([*bar[:-1], str(tmp_path / "board" / "L" / "000.png"), *board], "is named like an image or a movie"),
     ):
         assert main(arguments) == 2 and message in capsys.readouterr().err
