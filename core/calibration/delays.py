@@ -6,6 +6,7 @@ Camera c takes image n at the instant n + d_c, in images; camera 0 sets the cloc
     ∂v / ∂d_c = −p'(−d_c)                                                                                                       (2)
 
 The first d_c come from pairs of cameras, without knowing the cameras: the delay at which one fundamental matrix fits best.      (3)
+Pairs that contradict one another are compared by how well all pairs fit.
 """
 
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ JUMP = 8.0  # times the median: further from the path through its neighbours, a 
 JUMP_ROUNDS = 6
 FEWEST_AROUND, MOST_AROUND = 3, 4  # points from which one is predicted
 FEWEST_POINTS = 24  # of a pair of cameras
+AGREE = 0.3  # images: delays of pairs that differ by less
 LEAST_SHARE = 0.4  # of the positions that the pair shares at once: fewer fit by chance
 
 
@@ -184,6 +186,19 @@ def first_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> n
         delay[j] = delay[i] + _delay_between(moving, size_px, (i, j), labelled)
         placed.append(j)
     return delay
+
+
+def agreeing_delays(moving: MovingPoints, size_px: np.ndarray, labelled: bool) -> np.ndarray:
+    """`first_delays`; where pairs of cameras contradict one another, of the delays behind each camera those at which all pairs fit best."""
+    late, C = first_delays(moving, size_px, labelled), len(size_px)
+    between = np.zeros((C, C))
+    for i in range(C):
+        for j in range(i + 1, C):
+            between[i, j] = _delay_between(moving, size_px, (i, j), labelled)
+            between[j, i] = -between[i, j]
+    if np.abs(late - late[:, None] - between).max() < AGREE:
+        return late
+    return min([late, *(row - row[0] for row in between)], key=lambda found: misfit(moving, size_px, found, labelled))
 
 
 def misfit(moving: MovingPoints, size_px: np.ndarray, delay_images: np.ndarray, labelled: bool) -> float:

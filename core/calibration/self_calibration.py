@@ -36,7 +36,7 @@ from .bundle import (
     normal_equations,
     residuals_of,
 )
-from .delays import MovingPoints, first_delays, in_order, moving_points, without_jumps
+from .delays import MovingPoints, agreeing_delays, in_order, moving_points, without_jumps
 from .fisheye_bar import fisheye_delays, fisheye_network
 from .helmert import Partial
 from .network import BarNetwork, Network, Observations
@@ -128,7 +128,7 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
 
 def delays_of_bars(bars: BarObservations) -> np.ndarray:
     """How late each camera is (C,), if its lens keeps lines nearly straight."""
-    return first_delays(moving_points(bars.frames, bars.xy_px), bars.size_px, bars.labelled)
+    return agreeing_delays(moving_points(bars.frames, bars.xy_px), bars.size_px, bars.labelled)
 
 
 def calibrate_from(

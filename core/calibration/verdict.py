@@ -85,14 +85,25 @@ def refuse_if_useless(calibration: Calibration) -> None:
         if calibration.observations.views(used)[:, c].sum() < calibration.observations.fewest_positions:
             raise InputError(
                 f"The image points of camera {name} do not agree with the other cameras (only {int(used[:, c].sum())} of "
-                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same {noun}."
+                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same {noun}"
+                f"{_or_moved(calibration)}."
             )
     fits = used.sum() / max(visible.sum(), 1)
     if fits < MIN_FITTING or positions_used(calibration) < calibration.observations.fewest_positions:
         raise InputError(
             f"Only {positions_used(calibration)} {noun} positions fit one rig ({100 * fits:.0f} % of the image points); "
-            f"check that the sequences start at the same instant, and {_words(calibration)['other']}."
+            f"check that the sequences start at the same instant, and {_words(calibration)['other']}{_or_moved(calibration)}."
         )
+
+
+def _or_moved(calibration: Calibration) -> str:
+    """What else may be wrong where another object gives the poses of the cameras, too."""
+    if calibration.other is None or calibration.other.lenses_only:
+        return ""
+    return (
+        ", and that no camera was moved between the films of the bar and the board; if one was, let the board give the lenses only "
+        "(--lenses-only)"
+    )
 
 
 def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
@@ -110,7 +121,7 @@ def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
     if not quality.predicted.rms_m <= USELESS_PART * _distance(calibration):
         raise InputError(
             f"With these {noun} positions the error would be about {1e3 * quality.predicted.rms_m:.0f} mm in space, which is useless; "
-            f"{advice(calibration, quality)}."
+            f"{_ended(calibration.doubt or advice(calibration, quality))}"
         )
     if quality.mirror < MIRROR:
         raise InputError(f"A mirrored rig, with near and far swapped, fits the images as well; {_words(calibration)['deeper']}.")
@@ -127,7 +138,7 @@ def judge(calibration: Calibration, quality: Quality) -> Verdict:
         light = Light.YELLOW
     sentence = (
         f"{LIGHT_WORDS[light]}: the cameras place points within {_mm(error)} (RMS) in the {size} m {words['where']}, "
-        f"{distance:.1f} m away; {words['tested']} is right within {_mm(tested.rms_m)}{', but ' + doubt if doubt else ''}."
+        f"{distance:.1f} m away; {words['tested']} is right within {_ended(_mm(tested.rms_m) + (', but ' + doubt if doubt else ''))}"
     )
     if not calibration.converged:
         light, sentence = Light.RED, f"The adjustment did not converge, so its figures may be too good. {sentence}"
@@ -155,6 +166,11 @@ def _positions_of_other(calibration: Calibration) -> float:
         return 0.0
     seen, observations = calibration.other.used, calibration.other.observations
     return float(observations.views(seen).any(axis=1).sum()) / observations.good_positions
+
+
+def _ended(text: str) -> str:
+    """The end of a sentence; a question has its mark."""
+    return text if text.endswith("?") else f"{text}."
 
 
 def _mm(metres: float) -> str:

@@ -19,7 +19,7 @@ from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
-from ..images.sequence import ImageSequence
+from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
 from ..take.bar_file import write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
@@ -38,6 +38,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError("Give either the folder of the images of the bar or board, or --import with another tool's calibration.")
     if args.out is None:
         raise InputError("Give --out with the rig to write, such as --out rig.toml.")
+    if not args.format and args.out.suffix.lower() in IMAGE_ENDINGS + MOVIE_ENDINGS:
+        raise InputError(f"--out {args.out} is named like an image or a movie; give the file of the rig to write, such as rig.toml.")
     return _convert(args) if args.source is not None else _calibrate(args, board, monitor)
 
 

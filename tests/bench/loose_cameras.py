@@ -68,7 +68,7 @@ def film(folder: Path, view: Loose, studio: _Studio) -> None:
         picture = np.zeros(camera.size_px[::-1], np.float32)
         for low, high in zip(edges[:-1], edges[1:]):
             moment = view.time_s(n) + view.readout_s * ((low + high) / 2 / edges[-1] - 0.5)
-            picture[low:high] = expose(paint(camera, studio.body(moment), studio.noise, studio.backdrops[i]), sensor)[low:high]
+            picture[low:high] = expose(paint(camera, studio.subject.parts(moment), studio.noise, studio.backdrops[i]), sensor)[low:high]
         _write_png(folder / f"{n:05d}.png", digitize(picture, sensor, 1.0, np.random.default_rng([7, n, i])))
     for n in range(first):
         (folder / f"{n:05d}.png").symlink_to(folder / f"{first:05d}.png")
