@@ -52,6 +52,12 @@ class MeasuredFrame:
     removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters removed
     removed_why: np.ndarray  # (M,) see `why_removed`
 
+    @property
+    def of_patches(self) -> "MeasuredFrame":
+        """The frame without the points that were measured from their neighbours' surface: too weak a texture to be tracked."""
+        own = ~self.field.extended
+        return self if own.all() else replace(self, field=self.field.select(own), cloud=self.cloud.select(own))
+
 
 def measure_frames(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Iterator[MeasuredFrame]:
     """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.

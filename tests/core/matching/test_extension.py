@@ -20,6 +20,8 @@ from tricap.core.matching.patches import TemplatePatches
 from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from tricap.core.matching.seeds import sweep_seeds
 from tricap.core.matching.views import Views, template_grid
+from tricap.core.surface.cloud import SurfaceSettings, point_cloud
+from tricap.core.surface.measure import MeasuredFrame
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 SETTINGS = MatchingSettings()
@@ -113,3 +115,16 @@ def test_surrounded_points_on_weak_texture_need_no_texture_of_their_own(
     between[:] = (EXTENDED_M + SURROUNDED_M) / 2  # usual in these images, but not enough for points from their neighbours
     assert not fails_occlusion_check(field, views, SETTINGS).any()
     assert fails_occlusion_check(replace(field, extended=np.ones(len(between), dtype=bool)), views, SETTINGS).all()
+
+
+def test_tracks_start_from_patches_alone(weak: tuple[Views, MatchedField, Any]) -> None:
+    views, field, _ = weak
+    more = extended(views, field)
+    grey = np.full(views.template.shape, 100.0)
+    cloud = point_cloud(more, grey, views.base, views.reference, 0, SurfaceSettings())
+    none = np.zeros((0, 3, 2)), np.zeros(0, dtype=np.uint8)
+    frame = MeasuredFrame(frame=0, field=more, cloud=cloud, foreground=EVERYWHERE, key="", removed_px=none[0], removed_why=none[1])
+    assert np.array_equal(frame.of_patches.field.cell, field.cell)
+    assert np.array_equal(frame.of_patches.cloud.xyz_m, cloud.xyz_m[~more.extended])
+    only = frame.of_patches
+    assert only.of_patches is only
