@@ -32,6 +32,7 @@ from .patches import monomials, patch_offsets
 from .region_growing import RETRY_SMOOTHING_PX, MatchedField, loosened
 from .views import RADIUS_CELLS, TemplateGrid, Views
 
+WEAK_SIGMA_PX = 0.05  # px, median of the patches' sigmas, beyond which texture is weak: cloth of 8 % contrast has 0.06–0.07, prints 0.02
 WINDOW_EXTRA_PX = 4  # px by which the window is wider than `patch_px`
 WINDOW_SIGMA = 0.38  # sigma of the Gaussian window, in units of `patch_px`
 SLOPE_SIGMA = 0.1  # px/px in the search view that moves fastest: prior of the slopes
@@ -81,19 +82,18 @@ def constrain(
     if measured is None:
         return field
     result, ok = measured
-    return result.select(ok & _in_foreground(result, foreground, views.base))
+    return result.select(ok & in_foreground(result, foreground, views.base))
 
 
-def _surface_of(field: MatchedField, views: Views) -> PolynomialFit:
-    """The quadric of inverse depth about every cell of the field."""
-    w = 1 / views.base.to_camera(field.xyz_m)[:, 2]
+def surface_about(field: MatchedField, cell: np.ndarray, views: Views) -> PolynomialFit:
+    """The quadric of inverse depth about cells (n,) through the points of the field."""
     return fit_neighbours(
-        field.grid.neighbours(field.cell, field.cell),
+        field.grid.neighbours(field.cell, cell),
         field.xy[:, views.reference],
-        w,
-        field.grid.xy(field.cell),
+        1 / views.base.to_camera(field.xyz_m)[:, 2],
+        field.grid.xy(cell),
         degree=2,
-        min_scale=np.full(len(w), NEIGHBOUR_NOISE_PX / px_per_inverse_metre(views)),
+        min_scale=np.full(len(cell), NEIGHBOUR_NOISE_PX / px_per_inverse_metre(views)),
         radius_px=RADIUS_CELLS * field.grid.spacing_px,
     )
 
@@ -129,10 +129,10 @@ def _fitted(
 
 def _object_space(field: MatchedField, views: Views, settings: MatchingSettings, monitor: Monitor, required: int) -> Measured | None:
     """The field by pieces of surface; None where the calibration contradicts the images."""
-    around = _surface_of(field, views)
+    around = surface_about(field, field.cell, views)
     theta = around.coefficients[:, : 6 if settings.neighbours else 3]
     visible = _visible(field, views.reference)
-    prior = _prior(theta, px_per_inverse_metre(views), around.scatter, RADIUS_CELLS * field.grid.spacing_px)
+    prior = neighbours_prior(theta, px_per_inverse_metre(views), around.scatter, RADIUS_CELLS * field.grid.spacing_px)
     wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER_SIGMA0 * settings.max_sigma0)
     starts = SurfaceStarts(
         xy=field.grid.xy(field.cell),
@@ -142,7 +142,7 @@ def _object_space(field: MatchedField, views: Views, settings: MatchingSettings,
     )
 
     def match(which: np.ndarray, starts: SurfaceStarts, sigma_c: float, images: Views = views, extra_px: int = 0) -> SurfacePatch:
-        weight = _window(wide.patch_px + extra_px, views.rows.step)
+        weight = centre_window(wide.patch_px + extra_px, views.rows.step)
         chosen = replace(starts.select(which), window=np.broadcast_to(weight, (len(which), len(weight))))
         larger = replace(wide, patch_px=wide.patch_px + extra_px)
         return match_surface(images, chosen, larger, sigma_across_px=sigma_c, monitor=monitor)
@@ -154,6 +154,8 @@ def _object_space(field: MatchedField, views: Views, settings: MatchingSettings,
     if rig_sigma_px > MAX_RIG_SIGMA_PX:
         return None
     sigma_c = max(MIN_SIGMA_C_PX, rig_sigma_px)
+    weak = settings.neighbours and bool(sample.ok.any()) and float(np.median(sample.sigma_px[sample.ok])) > WEAK_SIGMA_PX
+    starts = replace(starts, without_noise=weak)
     found = match(np.arange(len(field.cell)), starts, sigma_c)
     visible, again = _without_unlike(visible, found, settings.min_correlation, required)
     starts = replace(starts, visible=visible)
@@ -167,8 +169,8 @@ def _object_space(field: MatchedField, views: Views, settings: MatchingSettings,
         if len(again):
             _replace(found, again, match(again, stiff, sigma_c, views.smoothed(RETRY_SMOOTHING_PX), SMOOTH_EXTRA_PX))
     agrees = _agrees(field, found, views, settings.patch_px)
-    result = _from_surface(field, found, _over_outline(around, field.grid, settings.patch_px), views, rig_sigma_px)
-    return result, found.ok & agrees
+    result = from_surface(field, found, over_outline(around, field.grid, settings.patch_px), views, rig_sigma_px)
+    return replace(result, rig_sigma_px=rig_sigma_px, weak_texture=weak), found.ok & agrees
 
 
 def _agrees(field: MatchedField, found: SurfacePatch, views: Views, patch_px: int) -> np.ndarray:
@@ -200,7 +202,7 @@ def _without_unlike(visible: np.ndarray, found: Found, smallest: float, required
     return visible, rows
 
 
-def _prior(start: np.ndarray, speed: float, scatter: np.ndarray, radius_px: int) -> SurfacePrior:
+def neighbours_prior(start: np.ndarray, speed: float, scatter: np.ndarray, radius_px: int) -> SurfacePrior:
     """The prior of slopes and curvatures from the neighbours, the weaker the rounder the surface; planes (N, 3) have none.
 
     Its errors follow from the neighbours' scatter (N,) about the quadric, of radius `radius_px`.
@@ -216,7 +218,7 @@ def _prior(start: np.ndarray, speed: float, scatter: np.ndarray, radius_px: int)
     return SurfacePrior(value=start, sigma=sigma, error=np.minimum(error, sigma))
 
 
-def _window(patch_px: int, row_step: int) -> np.ndarray:
+def centre_window(patch_px: int, row_step: int) -> np.ndarray:
     """Weights (n,) of a patch's pixels: a Gaussian about its centre."""
     u, v, _ = patch_offsets(patch_px, row_step)
     return np.exp(-0.5 * (u**2 + (v * row_step) ** 2) / (WINDOW_SIGMA * (patch_px - WINDOW_EXTRA_PX)) ** 2)
@@ -237,7 +239,7 @@ def _replace(found: Found, rows: np.ndarray, other: Found) -> None:
     found.status[rows[other.ok]] = other.status[other.ok]
 
 
-def _from_surface(field: MatchedField, found: SurfacePatch, outline: np.ndarray, views: Views, rig_sigma_px: float) -> MatchedField:
+def from_surface(field: MatchedField, found: SurfacePatch, outline: np.ndarray, views: Views, rig_sigma_px: float) -> MatchedField:
     """The field with the positions, shapes and covariances of pieces of surface, at the texture's centre of gravity.
 
     `outline` (N,) is the share of each patch that hangs over the edge.
@@ -298,7 +300,7 @@ def _model_covariance(
     return ray[:, :, None] * ray[:, None] * of_ray[:, None, None] + of_all[:, None, None] * np.eye(3)
 
 
-def _over_outline(around: PolynomialFit, grid: TemplateGrid, patch_px: int) -> np.ndarray:
+def over_outline(around: PolynomialFit, grid: TemplateGrid, patch_px: int) -> np.ndarray:
     """The share (N,) of each patch's window where no neighbour belongs to the same surface."""
     cells = np.arange(-RADIUS_CELLS, RADIUS_CELLS + 1) * grid.spacing_px
     window = np.exp(-0.5 * np.add.outer(cells**2, cells**2).ravel() / (WINDOW_SIGMA * patch_px) ** 2)
@@ -308,7 +310,7 @@ def _over_outline(around: PolynomialFit, grid: TemplateGrid, patch_px: int) -> n
 def _epipolar(field: MatchedField, views: Views, settings: MatchingSettings, monitor: Monitor, required: int) -> Measured:
     """The field by affine patches with collinearity observations."""
     rows, base, search, xy = views.rows, views.base, views.search, field.grid.xy(field.cell)
-    around = _surface_of(field, views)
+    around = surface_about(field, field.cell, views)
     theta, ray = around.coefficients[:, :3], base.rays(rows.to_frame(xy))
     lines = [Epipolar(base, views.cameras[k], rows, xy).centre(theta) for k in search]
     centre, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
@@ -333,7 +335,7 @@ def _epipolar(field: MatchedField, views: Views, settings: MatchingSettings, mon
     at[:, views.reference] = xy + found.offset
     at[:, search], A[:, search], K[:, search] = np.where(found.visible[..., None], found.xy, np.nan), found.shape, found.covariance
     square = np.sum(found.residual_px**2, axis=(1, 2))
-    outline = _over_outline(around, field.grid, settings.patch_px)
+    outline = over_outline(around, field.grid, settings.patch_px)
     of_model = _model_covariance(ray, theta[:, 0], px_per_inverse_metre(views), outline, rig_sigma_px, base)
     result = replace(
         field,
@@ -350,7 +352,7 @@ def _epipolar(field: MatchedField, views: Views, settings: MatchingSettings, mon
     return result, found.ok
 
 
-def _in_foreground(field: MatchedField, foreground: Foreground, base: Camera) -> np.ndarray:
+def in_foreground(field: MatchedField, foreground: Foreground, base: Camera) -> np.ndarray:
     """(N,) points whose rays meet and that lie in the foreground."""
     near, far = foreground.depth_range_m
     depth = base.to_camera(field.xyz_m)[:, 2]

@@ -145,6 +145,7 @@ class SurfaceStarts:
     visible: np.ndarray | None = None  # (N, S) which search views take part; None: all
     prior: SurfacePrior | None = None
     window: np.ndarray | None = None  # (N, n) weights of the patches' pixels; None: equal
+    without_noise: bool = False  # the texture's centre of gravity is that of the gradients' energy beyond their noise
 
     def select(self, rows: np.ndarray | slice) -> "SurfaceStarts":
         """Only these points."""
@@ -154,6 +155,7 @@ class SurfaceStarts:
             visible=None if self.visible is None else self.visible[rows],
             prior=None if self.prior is None else self.prior.select(rows),
             window=None if self.window is None else self.window[rows],
+            without_noise=self.without_noise,
         )
 
 
@@ -205,7 +207,13 @@ class _Adjustment:
     def __init__(self, views: Views, starts: SurfaceStarts, settings: MatchingSettings, sigma_across_px: float) -> None:
         xy, S = starts.xy, len(views.search)
         self._patches = TemplatePatches(
-            views.template, xy, settings.patch_px, views.rows.step, degree=1 if starts.theta.shape[1] == 3 else 2, weight=starts.window
+            views.template,
+            xy,
+            settings.patch_px,
+            views.rows.step,
+            degree=1 if starts.theta.shape[1] == 3 else 2,
+            weight=starts.window,
+            without_noise=starts.without_noise,
         )
         self._images = [views.images[k] for k in views.search]
         self._lines = [Epipolar(views.base, views.cameras[k], views.rows, xy) for k in views.search]

@@ -7,12 +7,17 @@ shift of that depth, the sigmas of both matches, and the share R² of the textur
 explains, in the view where it is smallest,
 
     u = √(shift² + σ_centre² + σ²) / R² ,   1 − R² = max(0, (1 − ρ²) s² − σ_n²) / s²                          (1)
+
+Where texture is weak, most centres show none of it. There a point that is surrounded by points of its own surface passes with a larger
+uncertainty: there is no other surface for a mixture. Points that were measured from their neighbours' surface (`extension`) are judged more
+strictly elsewhere.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
+from .constraints import over_outline, surface_about
 from .least_squares import MatchingSettings
 from .object_space import Epipolar, SurfacePrior, SurfaceStarts, match_surface, px_per_inverse_metre
 from .patches import TemplatePatches
@@ -26,6 +31,9 @@ ACROSS_SIGMA_PX = 0.03  # rows' px across the epipolar line
 LEAST_EXPLAINED = 0.25  # lower limit of R² in (1)
 LARGEST_M = 0.011  # m, acceptable uncertainty (1); of persons at 4 mm/px it removes two thirds of the gross errors with 3–8 % of the points
 MEDIANS = 2.2  # medians of (1) that are acceptable where most points are worse
+EXTENDED_M = 0.013  # m, acceptable uncertainty of points measured from their neighbours' surface
+SURROUNDED_M = 0.025  # m, and of points on weak texture, if no more than
+SURROUNDED = 0.3  # of their patch lacks points of the same surface
 
 
 def fails_occlusion_check(field: MatchedField, views: Views, settings: MatchingSettings) -> np.ndarray:
@@ -38,7 +46,12 @@ def fails_occlusion_check(field: MatchedField, views: Views, settings: MatchingS
         visible=np.delete(np.isfinite(field.xy).all(axis=2), views.reference, axis=1),
     )
     sigma_m = np.sqrt(np.trace(field.covariance_m2, axis1=1, axis2=2))
-    return ~acceptable(depth_uncertainty(views, starts, sigma_m, settings, px_per_inverse_metre=px_per_inverse_metre(views)))
+    u_m = depth_uncertainty(views, starts, sigma_m, settings, px_per_inverse_metre=px_per_inverse_metre(views))
+    if not field.weak_texture:
+        return ~acceptable(u_m)
+    good = np.where(field.extended, u_m <= EXTENDED_M, acceptable(u_m, ~field.extended))
+    outline = over_outline(surface_about(field, field.cell, views), field.grid, settings.patch_px)
+    return np.asarray(~good & ~((outline < SURROUNDED) & (u_m <= SURROUNDED_M)))
 
 
 def _planes(field: MatchedField, views: Views) -> np.ndarray:
@@ -77,7 +90,8 @@ def depth_uncertainty(
     return np.asarray(np.hypot(off_px * metres, sigma_m) / explained)
 
 
-def acceptable(uncertainty_m: np.ndarray) -> np.ndarray:
-    """(N,) which points' uncertainties (1) are small enough for a body, or for these images where most are larger."""
-    usual = float(np.median(uncertainty_m)) if len(uncertainty_m) else 0.0
+def acceptable(uncertainty_m: np.ndarray, usual_ones: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """(N,) which points' uncertainties (1) are small enough for a body, or for these images where most of the `usual_ones` are larger."""
+    of = uncertainty_m[usual_ones]
+    usual = float(np.median(of)) if len(of) else 0.0
     return np.asarray(uncertainty_m <= max(LARGEST_M, MEDIANS * usual))

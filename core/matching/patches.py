@@ -30,6 +30,8 @@ from ..images.sampling import SplineImage, correlated_noise, difference
 PIECE = 1 << 17  # pixels of a piece
 NOISE_ENERGY = 4.0  # grey values² / px², energy of a gradient that is taken as noise, not texture
 GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for white noise of variance 1; 1 / 2σ² after smoothing
+LEAST_TEXTURE = 0.15  # of the gradients' energy, taken as texture where a centre of gravity is without noise
+MOST_OFFSET = 0.75  # of half the patch, between its centre and that centre of gravity
 MIN_CONTRAST = 0.5  # grey values, smallest RMS contrast of a patch
 UPPER = np.triu_indices(3)  # of the products of 1, u, v
 
@@ -159,10 +161,21 @@ def _interpolated(
 
 
 class TemplatePatches:
-    """N patches of one image about `xy` (N, 2); `weight` (N, n) of their pixels, or None for equal weights."""
+    """N patches of one image about `xy` (N, 2); `weight` (N, n) of their pixels, or None for equal weights.
+
+    `without_noise`: their centres of gravity are those of the gradients' energy beyond that of the image's noise.
+    """
 
     def __init__(
-        self, image: SplineImage, xy: np.ndarray, patch_px: int, row_step: int, *, degree: int = 1, weight: np.ndarray | None = None
+        self,
+        image: SplineImage,
+        xy: np.ndarray,
+        patch_px: int,
+        row_step: int,
+        *,
+        degree: int = 1,
+        weight: np.ndarray | None = None,
+        without_noise: bool = False,
     ) -> None:
         self.u, self.v, self.half = patch_offsets(patch_px, row_step)
         self.monomials = monomials(self.u, self.v, degree)  # (n, P)
@@ -182,13 +195,19 @@ class TemplatePatches:
         self.noise_factor = correlated_noise(self._wfx.reshape(patch), self._wfy.reshape(patch), image.smoothing)  # (N,)
         smooth = image.smoothing[0]
         self.gradient_noise = min(GRADIENT_NOISE, 0.5 / smooth**2 if smooth else GRADIENT_NOISE) / self.noise_factor  # (N,)
-        self._centre(fx, fy)
+        self._centre(fx, fy, 2 * GRADIENT_NOISE * image.noise**2 if without_noise and not smooth else 0.0)
         self._moments(fx, fy)
 
-    def _centre(self, fx: np.ndarray, fy: np.ndarray) -> None:
+    def _centre(self, fx: np.ndarray, fy: np.ndarray, noise_energy: float) -> None:
         energy = self._wfx * fx + self._wfy * fy + 1e-3 * self._weight
         total = np.maximum(energy.sum(axis=1, keepdims=True), 1e-9)
+        if noise_energy:  # noise lies all over the patch: it draws the centre of weak texture to that of the patch
+            energy = energy - np.float32(noise_energy) * self._weight
+            total = np.maximum(energy.sum(axis=1, keepdims=True), LEAST_TEXTURE * total)
         moment = (energy @ np.stack([self.u, self.v, self.u**2, self.v**2], axis=1) / total).astype(np.float64)
+        if noise_energy:
+            out = np.linalg.norm(moment[:, :2] / self.half, axis=1)
+            moment[:, :2] *= np.minimum(1.0, MOST_OFFSET / np.maximum(out, 1e-9))[:, None]
         self.offset = moment[:, :2]  # (N, 2) centre of gravity of the gradients' energy
         self.spread = np.maximum(moment[:, 2:] - moment[:, :2] ** 2, 0.0)  # (N, 2)
 

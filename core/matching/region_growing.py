@@ -10,7 +10,7 @@ one array, and a point is accepted only if enough views match it, its rays meet,
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,7 @@ LOOSE_CORRELATION = 0.15  # below the smallest correlation: weak texture is litt
 LARGEST_PATCH_M = 0.03  # m on the surface
 SEED_MEDIANS = 3.0  # medians of the seeds' residuals that a residual may reach
 MAX_LIMIT_PX = 2.5  # px, and never more than this
+OF_FIELD = ("grid", "tried", "limit_px", "rig_sigma_px", "weak_texture")  # of a whole `MatchedField`; the others are arrays of points
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -104,8 +105,11 @@ class MatchedField:
     sigma0: np.ndarray  # (N,) of the intersection
     spread: np.ndarray  # (N, 2) variance of the texture's energy in the patch of the reference view
     smoothed: np.ndarray  # (N,) matched in the smoothed images only
+    extended: np.ndarray  # (N,) measured from the surface of the neighbours, where texture is weak (`extension`)
     tried: int  # how many cells were tried
     limit_px: float  # the residual that was allowed
+    rig_sigma_px: float = 0.0  # the calibration's own error, as the constraint found it
+    weak_texture: bool = False  # the patches' sigmas are large, as the constraint found
 
     @property
     def complete(self) -> np.ndarray:
@@ -114,8 +118,15 @@ class MatchedField:
 
     def select(self, rows: np.ndarray) -> "MatchedField":
         """The field with only these rows (a mask or indices)."""
-        names = [n for n in MatchedField.__dataclass_fields__ if n not in ("grid", "tried", "limit_px")]
-        return MatchedField(grid=self.grid, tried=self.tried, limit_px=self.limit_px, **{n: getattr(self, n)[rows] for n in names})
+        chosen: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in OF_FIELD}
+        return replace(self, **chosen)
+
+    def joined(self, other: "MatchedField") -> "MatchedField":
+        """The field with the rows of another one of the same grid, in the order of the cells."""
+        order = np.argsort(np.concatenate([self.cell, other.cell]), kind="stable")
+        names = [f.name for f in fields(self) if f.name not in OF_FIELD]
+        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)])[order] for name in names}
+        return replace(self, **both)
 
 
 class _Cells:
@@ -192,6 +203,7 @@ class _Cells:
             sigma0=self.sigma0[cell],
             spread=self.spread[cell],
             smoothed=self.smoothed[cell],
+            extended=np.zeros(len(cell), dtype=bool),
             limit_px=limit_px,
             tried=int(self.tried.sum()),
         )

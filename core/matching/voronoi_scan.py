@@ -297,6 +297,7 @@ def _merged(scans: Sequence[_Scan], views: Views, grid: TemplateGrid, growing: G
         sigma0=point.sigma0,
         spread=np.stack([s.spread[cell] for s in scans])[matched.argmax(axis=0), np.arange(n)],
         smoothed=np.zeros(n, dtype=bool),
+        extended=np.zeros(n, dtype=bool),
         tried=int(np.any([s.tried for s in scans], axis=0).sum()),
         limit_px=limit_px,
     )

@@ -14,8 +14,9 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching import foreground as fg
 from ..matching.constraints import constrain
+from ..matching.extension import extend
 from ..matching.occlusion_check import fails_occlusion_check
-from ..matching.region_growing import MatchedField, grow_regions
+from ..matching.region_growing import OF_FIELD, MatchedField, grow_regions
 from ..matching.seeds import Approximations
 from ..matching.views import TemplateGrid
 from ..matching.voronoi_scan import voronoi_scan
@@ -50,6 +51,12 @@ class MeasuredFrame:
     key: str
     removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters removed
     removed_why: np.ndarray  # (M,) see `why_removed`
+
+    @property
+    def of_patches(self) -> "MeasuredFrame":
+        """The frame without the points that were measured from their neighbours' surface: too weak a texture to be tracked."""
+        own = ~self.field.extended
+        return self if own.all() else replace(self, field=self.field.select(own), cloud=self.cloud.select(own))
 
 
 def measure_frames(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Iterator[MeasuredFrame]:
@@ -98,17 +105,25 @@ def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, moni
     views, ref, where = now.views, now.views.reference, replace(start.where, silhouettes=now.silhouettes)
     field = _matched(now, start.seeds, settings, where, monitor)
     why = why_removed(field, views.base, ref, settings.surface)
-    clean = np.flatnonzero(why == 0)
-    why[clean[fails_occlusion_check(field.select(clean), views, settings.matching)]] = OCCLUDED
-    cloud = point_cloud(field.select(why == 0), now.grey[ref], views.base, ref, now.frame, settings.surface)
+    removed_xy, removed_why = field.xy[why > 0], why[why > 0]
+    field = field.select(why == 0)
+    if field.weak_texture:
+        field = _single(extend(field, views, settings.matching, foreground=where, monitor=monitor))
+        why = why_removed(field, views.base, ref, settings.surface)
+        removed_xy, removed_why = np.concatenate([removed_xy, field.xy[why > 0]]), np.concatenate([removed_why, why[why > 0]])
+        field = field.select(why == 0)
+    occluded = fails_occlusion_check(field, views, settings.matching)
+    removed_xy = np.concatenate([removed_xy, field.xy[occluded]])
+    removed_why = np.concatenate([removed_why, np.full(np.count_nonzero(occluded), OCCLUDED, dtype=np.uint8)])
+    field = field.select(~occluded)
     return MeasuredFrame(
         frame=now.frame,
-        field=field.select(why == 0),
-        cloud=in_full_pixels(cloud, now.footage),
+        field=field,
+        cloud=in_full_pixels(point_cloud(field, now.grey[ref], views.base, ref, now.frame, settings.surface), now.footage),
         foreground=start.where,
         key=start.key,
-        removed_px=now.footage.to_full(views.rows.to_frame(field.xy[why > 0])).astype(np.float32),
-        removed_why=why[why > 0],
+        removed_px=now.footage.to_full(views.rows.to_frame(removed_xy)).astype(np.float32),
+        removed_why=removed_why,
     )
 
 
@@ -133,7 +148,7 @@ def _single(field: MatchedField) -> MatchedField:
 
 
 def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
-    arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(MatchedField) if f.name not in ("grid", "tried", "limit_px")}
+    arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(MatchedField) if f.name not in OF_FIELD}
     arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
     arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
     arrays |= {
@@ -142,6 +157,7 @@ def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
         "method": np.array(m.foreground.method),
         "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]),
         "limit_px": np.array(m.field.limit_px),
+        "texture": np.array([m.field.rig_sigma_px, m.field.weak_texture]),
         "reduction": footage.reduction,
         "removed_px": m.removed_px,
         "removed_why": m.removed_why,
@@ -175,8 +191,15 @@ def _measured(footage: Footage, frame: int, key: str, a: dict[str, np.ndarray]) 
     values = {
         k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")
     }
+    rig_sigma_px, weak = a.get("texture", np.zeros(2))  # earlier versions did not store this,
+    values.setdefault("extended", np.zeros(len(values["cell"]), dtype=bool))  # nor this
     field = MatchedField(
-        grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)), tried=tried, limit_px=float(a["limit_px"]), **values
+        grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)),
+        tried=tried,
+        limit_px=float(a["limit_px"]),
+        rig_sigma_px=float(rig_sigma_px),
+        weak_texture=bool(weak),
+        **values,
     )
     cloud = PointCloud(
         frame=frame,

@@ -30,7 +30,7 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import SurfaceSettings
 
-ALGORITHM = "surface 21"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 22"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
 SEED_SPEED_M_S = 1.0  # sigma of the speed in depth at which seeds come from the frame before

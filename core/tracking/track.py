@@ -137,7 +137,7 @@ def _thinned(field: MatchedField, spacing_px: int) -> np.ndarray:
     return np.flatnonzero((i % n == 0) & (j % n == 0))
 
 
-ALGORITHM = "tracking 15"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 16"  # part of every key: raise it when the same input gives other numbers
 MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
 
 
@@ -244,7 +244,7 @@ def _advance(
     start_new: bool,
 ) -> TrackedFrame:
     """The tracked points in the frame of the view, whose surface is given; with `start_new` new ones where it has none."""
-    in_space = view.tracking.scheme == "space"
+    surface, in_space = surface.of_patches, view.tracking.scheme == "space"
     if in_space:
         view = replace(view, curvature=_curvature(view, surface))
     if state.current is None or images is None:

@@ -12,7 +12,7 @@ from tricap.core.geometry.robust import PolynomialFit
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.constraints import OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX, RAY_SIGMA_PX, _model_covariance, _over_outline, constrain
+from tricap.core.matching.constraints import OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX, RAY_SIGMA_PX, _model_covariance, constrain, over_outline
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
 from tricap.core.matching.multi_image import MultiImageStarts, match_multi_image
@@ -252,7 +252,7 @@ def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
     edge_on = np.cross(facing, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(facing, [0.0, 1.0, 0.0]))
     there = (np.arange(49) % 7 < 4).astype(float)[None]
     half, near, far = (
-        _over_outline(PolynomialFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), weights=a), grid, 13)[0]
+        over_outline(PolynomialFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), weights=a), grid, 13)[0]
         for a in (there, np.where(np.arange(49) % 7 < 6, 1.0, 0.0)[None], np.ones((1, 49)))
     )
     assert 0.3 < half < 0.5 and near < 0.1 * half and far == 0.0  # the window hardly reaches the last column
