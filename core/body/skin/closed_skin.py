@@ -33,7 +33,7 @@ from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
 from .ends import caged, rounded
-from .limb_weights import with_limb_borders
+from .limb_weights import with_limb_borders, with_neck
 from .mesh import SkinSettings, corner_uv, refined
 from .welding import cut, welded
 from .whole_surface import WholeSurface
@@ -71,7 +71,7 @@ def within(near: "sparse.csr_matrix", chosen: np.ndarray, rings: int) -> np.ndar
 
 def seam_jumps(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.ndarray:
     """The jumps (F, 4) at the edges of the quads [rad], 0 at those that are no border of two parts. `part` (V,)."""
-    beyond, edge = _beyond(faces)
+    beyond, edge = beyond_edges(faces)
     corner = vertices[faces]
     normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -151,7 +151,7 @@ def _plate(vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, moved: np.
     return np.asarray(vertices[moved] - spsolve(normal, free.T @ (bending @ vertices)))
 
 
-def _beyond(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def beyond_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The quad beyond each edge (F, 4), and which of its edges that is (F, 4); every edge has two quads."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     pairs = np.lexsort(ends.T).reshape(-1, 2)
@@ -227,7 +227,8 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     coarse = _sparse(whole.vertices_m, faces, part, surface) & ~whole.end
     uneven = np.setdiff1d(np.union1d(free, within(near, coarse, SEAM_RINGS)), np.flatnonzero(whole.end))
     vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, part, surface), faces, near, free)
-    weights = _smoothed(with_limb_borders(shape, vertices, part, whole.weights), vertices, faces, near, free)
+    weights = with_neck(shape, vertices, faces, with_limb_borders(shape, vertices, part, whole.weights))
+    weights = _smoothed(weights, vertices, faces, near, free)
     kept = 1 - np.maximum(loose, whole.end)
     end = whole.end.astype(np.float64)
     for pieces in (settings.detail, detail):

@@ -1,22 +1,23 @@
 """The head of a skin, put where the points of all frames measured it, before the relief.
 
 The anatomical head (ends) has the place and size of the fitted balls, whose face is no better than an ellipsoid's: nose and chin may lie
-centimetres beside the person's, and a relief would then give the chin the shape of a mouth. In the axes of the head's bone the vertices x
-move by a similarity of six parameters p, a shift up and ahead, a pitch, and three scales, to the degree w to which they are the head's,
-smoothed over the neck:
+centimetres beside the person's, the face may look aside, and a relief would then give the chin the shape of a mouth and flatten a cheek. In
+the axes of the head's bone the vertices x move by a similarity of nine parameters p, a shift t, a rotation Q and three scales S, to the
+degree w to which they are the head's, smoothed over the neck:
 
-    x' = x + w (S Q(x − c) + c + t − x) ,   Σ ρ( m·(X − x')/σ ) + Σ (p/σ_p)² → min                           (1)
+    x' = x + w (Q S (x − c) + c + t − x) ,   Σ ρ( m·(X − x')/σ ) + pᵀ Σ⁻¹ p → min                              (1)
 
-with X, m a point and its normal in the head's axes, x' the vertex nearest to it, renewed in every step. ρ is Tukey's biweight. A head on
-which few points were measured stays where it is.
+with Σ = diag(σ_p²), and more for a common scale. X and m are a point and its normal in the head's axes, x' the nearest of those vertices
+whose normals are alike, renewed in every step, ρ Tukey's biweight. A head on which few points were measured stays where it is.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...geometry.robust import TUKEY
+from ...geometry.rotation import cross_matrix, rotation_from_vector, vector_from_rotation
 from ..shape import BodyShape
 from ..skeleton import bone_frames
 from .closed_skin import OneSkin
@@ -25,13 +26,16 @@ from .extremities import has_end
 from .relief import LEAST_COSINE, Nearby, SurfacePoints
 from .surface_operators import vertex_normals
 
-PRIOR = np.array([0.03, 0.015, 0.15, 0.10, 0.10, 0.10])  # σ_p: up and ahead [m], pitch [rad], ln of the scales to the side, up, ahead
+MEAN = np.array([0.0, 0.0, 0.0, -0.38, 0.0, 0.0, 0.0, 0.0, 0.0])  # of p: the fitted head is an ellipsoid along the line from chin to crown
+PRIOR = np.array([0.01, 0.03, 0.015, 0.1, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p of t [m], Rodrigues vector of Q, ln S: to the side, up, ahead
+SIZE = 0.1  # … and what the three ln S have in common
 FARTHEST_M = 0.03  # of a point from the skin
 SIGMA_M = 0.003  # σ: what a face differs from the anatomical one
-EACH_FOR = 25.0  # as many points count as one: their errors are alike
+EACH_FOR = 100.0  # as many points count as one: their errors are alike
 FEWEST = 300  # points
-MOST_FRAMES = 12  # evenly
-STEPS = 12
+MOST_FRAMES = 24  # evenly
+CANDIDATES = 4  # nearest vertices of a point
+STEPS = 15
 OWN = 0.5  # weight of the head in vertices that are compared
 
 
@@ -47,11 +51,29 @@ def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[Surface
     points, normals = _in_head(shape, b, frames, local[own > OWN])
     if len(points) < FEWEST:
         return skin
-    middle, across = local[own > OWN].mean(axis=0), vertex_normals(skin.vertices_m, skin.faces) @ R[b]
-    p = _registered(local[own > OWN], across[own > OWN], middle, points, normals)
     share = Nearby(skin.vertices_m, skin.faces).mean(own[:, None])  # wider than the weights, or the throat would fold
-    moved = local + share * (_moved(local, middle, p) - local)
-    return replace(skin, vertices_m=head[b] + moved @ R[b].T)
+    movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R[b], share=share, own=own > OWN)
+    p = _registered(movable, points, normals)
+    return replace(skin, vertices_m=head[b] + movable.at(p) @ R[b].T)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Movable:
+    """The vertices of a skin in the axes of the head's bone."""
+
+    x: np.ndarray  # (V, 3)
+    across: np.ndarray  # (V, 3) normals
+    share: np.ndarray  # (V, 1) w of (1)
+    own: np.ndarray  # (V,) bool: the head's; the others only take their points from the jaw and the nape
+
+    @property
+    def middle(self) -> np.ndarray:
+        """c of (1)."""
+        return np.asarray(self.x[self.own].mean(axis=0))
+
+    def at(self, p: np.ndarray) -> np.ndarray:
+        """x' (V, 3) of (1)."""
+        return np.asarray(self.x + self.share * (_moved(self.x, self.middle, p) - self.x))
 
 
 def _in_head(shape: BodyShape, b: int, frames: Sequence[SurfacePoints], vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,40 +92,44 @@ def _in_head(shape: BodyShape, b: int, frames: Sequence[SurfacePoints], vertices
 
 def _moved(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) moved entirely."""
-    return np.asarray(((x - middle) * np.exp(p[3:])) @ _pitch(p[2]).T + middle + [0.0, p[0], p[1]])
+    return np.asarray(((x - middle) * np.exp(p[6:])) @ rotation_from_vector(p[3:6]).T + middle + p[:3])
+
+
+def _changed(p: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """p (9,) after a step (9,), of which the rotation follows the one that is there."""
+    turned = vector_from_rotation(rotation_from_vector(step[3:6]) @ rotation_from_vector(p[3:6]))
+    return np.concatenate([p[:3] + step[:3], turned, p[6:] + step[6:]])
 
 
 def _derivatives(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Those of `_moved` with respect to p, (V, 3, 6)."""
-    scaled, turn, shift = (x - middle) * np.exp(p[3:]), _pitch(p[2]), np.zeros((len(x), 3, 2))
-    shift[:, 1, 0] = shift[:, 2, 1] = 1.0
-    pitch = (scaled * [0.0, 1.0, 1.0]) @ _pitch(p[2] + np.pi / 2).T * [0.0, 1.0, 1.0]
-    return np.concatenate([shift, pitch[:, :, None], turn * scaled[:, None]], axis=2)
+    """Those of `_moved` with respect to a step, (V, 3, 9)."""
+    Q, scaled = rotation_from_vector(p[3:6]), (x - middle) * np.exp(p[6:])
+    shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    return np.concatenate([shift, -cross_matrix(scaled @ Q.T), Q * scaled[:, None]], axis=2)
 
 
-def _pitch(angle: float) -> np.ndarray:
-    """Q (3, 3)."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
-
-
-def _registered(x: np.ndarray, across: np.ndarray, middle: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """p (6,) of (1) for vertices with normals (V, 3)."""
+def _registered(skin: _Movable, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """p (9,) of (1)."""
     from scipy.spatial import cKDTree
 
-    p = np.zeros(len(PRIOR))
+    p, rows = MEAN, np.arange(len(points))
+    common = np.repeat([0.0, SIZE], (6, 3))
+    information = np.linalg.inv(np.diag(PRIOR**2) + np.outer(common, common))
     for _ in range(STEPS):
-        at = _moved(x, middle, p)
-        distance, near = cKDTree(at).query(points, distance_upper_bound=FARTHEST_M)
-        good = np.flatnonzero(np.isfinite(distance))
-        good = good[np.einsum("nk,nk->n", across[near[good]], normals[good]) > LEAST_COSINE]
+        at = skin.at(p)
+        distance, near = cKDTree(at).query(points, k=CANDIDATES, distance_upper_bound=FARTHEST_M)
+        near = np.minimum(near, len(at) - 1)
+        cosine = np.einsum("nkc,nc->nk", skin.across[near] @ rotation_from_vector(p[3:6]).T, normals)
+        best = np.argmin(np.where(cosine > LEAST_COSINE, distance * (2 - cosine), np.inf), axis=1)
+        found = near[rows, best]
+        good = np.flatnonzero(np.isfinite(distance[rows, best]) & (cosine[rows, best] > LEAST_COSINE) & skin.own[found])
         if len(good) < FEWEST:
             return np.zeros(len(PRIOR))
-        n, i = normals[good], near[good]
+        n, i = normals[good], found[good]
         r = np.einsum("nk,nk->n", n, points[good] - at[i])
-        J = np.einsum("nk,nkp->np", n, _derivatives(x[i], middle, p))
+        J = skin.share[i] * np.einsum("nk,nkp->np", n, _derivatives(skin.x[i], skin.middle, p))
         spread = max(SIGMA_M, 1.4826 * float(np.median(np.abs(r))))
         weight = np.clip(1 - (r / (TUKEY * spread)) ** 2, 0, None) ** 2 / (EACH_FOR * spread**2)
-        normal = J.T @ (weight[:, None] * J) + np.diag(PRIOR**-2)
-        p = p + np.linalg.solve(normal, J.T @ (weight * r) - p / PRIOR**2)
+        normal = J.T @ (weight[:, None] * J) + information
+        p = _changed(p, np.linalg.solve(normal, J.T @ (weight * r) - information @ (p - MEAN)))
     return p

@@ -1,4 +1,6 @@
-"""Weights where legs leave the trunk: their share rises across an oblique plane through the joint, whatever part a vertex was cast with.
+"""Weights where legs leave the trunk, and of the neck.
+
+The share of a leg rises across an oblique plane through the joint, whatever part a vertex was cast with.
 
 The seam of the meshes (welding) is where the surface of the limb leaves that of the trunk: for a leg, a hand's breadth below the joint.
 With weights that change there, a bent hip dents the front of the thigh. Flesh moves with the thigh from the groin's crease on, which runs
@@ -7,6 +9,11 @@ from the pubis outwards and upwards in front and lower behind:
     T = smooth(½ + s/2h) · side ,   s = n·(X − X_joint) − s_0 ,   n ∝ y + a out + b ahead                    (1)
 
 with y along the limb's first own bone, `out` away from the middle, h, s_0 in lengths of that bone. w' = (1 − T) w_trunk + T w_limb.
+
+A neck bends from the collar bones to the jaw, and not within the 3 cm between the ends of the chest's bone and of the head, where the
+throat would fold. There u is harmonic on the mesh, 0 below the collar and 1 at the jaw, and chest, neck and head have the shares
+
+    chest ½(|1 − 2u| + 1 − 2u) ,   neck 1 − |1 − 2u| ,   head ½(|1 − 2u| − 1 + 2u) ,   |·| rounded             (2)
 """
 
 from dataclasses import dataclass
@@ -16,7 +23,10 @@ import numpy as np
 from ..parts import body_parts
 from ..shape import BodyShape
 from ..skeleton import bone_frames
+from .ends import HEAD
+from .extremities import NECK
 from .rays import smooth
+from .surface_operators import factorised, laplacian
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +66,39 @@ def with_limb_borders(shape: BodyShape, vertices: np.ndarray, part: np.ndarray, 
         near = 1 - smooth((np.linalg.norm(offset, axis=1) / length - border.reach[0]) / (border.reach[1] - border.reach[0]))
         share = smooth(0.5 + s / (2 * border.half)) * np.where(part == p, 1 - near * (1 - side), side * near * (part == limb.parent))
         found = _with_share(found, _from(shape, b), share, np.isin(part, (p, limb.parent)), (limb.attachment, b))
+    return found
+
+
+CHEST = "chest"
+COLLAR = 0.42  # how far below the neck's joint the collar is in the middle of the body, in lengths of the chest's bone …
+FALL = 0.35  # … and how much lower it is farther ahead
+JAWS = 0.97  # weight of the head in vertices that are entirely the head's
+ROUNDED = 0.3  # of |·| in (2)
+
+
+def with_neck(shape: BodyShape, vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The weights (V, B) of vertices (V, 3) of the rest pose, with those of chest, neck and head as in (2)."""
+    from scipy import sparse
+
+    names = [bone.name for bone in shape.skeleton.bones]
+    if not {CHEST, NECK, HEAD} <= set(names):
+        return weights
+    chest, neck, head = three = [names.index(name) for name in (CHEST, NECK, HEAD)]
+    R, joint = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
+    local = (vertices - joint[neck]) @ R[chest] / shape.lengths_m[chest]
+    below, jaw = local[:, 1] + FALL * local[:, 2] < -COLLAR, weights[:, head] > JAWS
+    C, _ = laplacian(vertices, faces)
+    free = ~below & ~jaw & (weights[:, three].sum(axis=1) > NONE)
+    if not (free.any() and jaw.any()):
+        return weights
+    rows = np.flatnonzero(free)
+    u = jaw.astype(np.float64)
+    u[rows] = factorised(sparse.csc_matrix(-C[rows][:, rows])).solve(C[rows] @ u)
+    bend = np.hypot(1 - 2 * u, ROUNDED) - (np.hypot(1, ROUNDED) - 1)
+    share = np.clip(np.stack([(bend + 1 - 2 * u) / 2, 1 - bend, (bend - 1 + 2 * u) / 2], axis=1), 0, None)
+    found = weights.copy()
+    total = weights[np.ix_(rows, three)].sum(axis=1, keepdims=True)
+    found[np.ix_(rows, three)] = total * share[rows] / share[rows].sum(axis=1, keepdims=True)
     return found
 
 

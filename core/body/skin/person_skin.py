@@ -1,6 +1,6 @@
 """The skin of a person: made in the rest pose, faired, with the measured relief, and posed in every frame; its file skin/rest.npz.
 
-    metaballs ── one closed mesh (closed_skin) ── without rings and ledges (fairing) ── what all frames measured (relief)
+    metaballs ── one closed mesh (closed_skin) ── without rings and ledges (fairing, edges) ── what all frames measured (relief)
       ──▶ OneSkin in the rest pose ── posing ──▶ skin/NNNN.ply;  scene and exports bind it to their armature
 
 The mesh of a whole body has DETAIL² quads for each quad of its cage; the skins of the frames have the quads of the cage.
@@ -17,8 +17,10 @@ from ...foundation.progress import Monitor
 from ..shape import BodyShape
 from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
+from .edges import eased, faired_outside_folds, without_folds
+from .ends import HEAD
 from .fairing import OF_RELIEF, anatomical, faired
-from .fingers import RIGID_BONE
+from .fingers import FINGER_BONE, RIGID_BONE
 from .head_place import with_head_in_place
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
@@ -40,7 +42,15 @@ def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
     skin = one_skin(shape, settings, DETAIL)
     if not settings.fair:
         return skin
-    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, _kept(skin, shape)))
+    fair = faired(skin.vertices_m, skin.faces, _kept(skin, shape))
+    return replace(skin, vertices_m=eased(fair, skin.faces, _plain(skin, shape)))
+
+
+def _plain(skin: OneSkin, shape: BodyShape) -> np.ndarray:
+    """(V,) bool: the vertices that belong neither to the head nor to fingers or toes, whose shapes have edges."""
+    names = [bone.name for bone in shape.skeleton.bones]
+    head, digits = [name == HEAD for name in names], [FINGER_BONE.fullmatch(name) is not None for name in names]
+    return np.asarray((skin.weights[:, head].sum(axis=1) < 0.3) & (skin.weights[:, digits].sum(axis=1) < 0.05))
 
 
 def _kept(skin: OneSkin, shape: BodyShape) -> np.ndarray:
@@ -58,10 +68,13 @@ def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mi
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    skin = with_head_in_place(skin, shape, frames)
-    relief, along = measured_relief(skin, shape, frames, mirror, monitor), directions(skin, shape)
-    moved = faired(skin.vertices_m + relief.displacement_m[:, None] * along, skin.faces, _kept(skin, shape), OF_RELIEF)
-    moved = unflipped(moved, skin.faces, np.ones(len(moved), dtype=bool))
+    straight, skin = skin, with_head_in_place(skin, shape, frames)
+    relief, along = measured_relief(skin, shape, frames, mirror, monitor, straight), directions(skin, shape)
+    displacement = without_folds(skin.vertices_m, skin.faces, relief.displacement_m, along)
+    rough, every = skin.vertices_m + displacement[:, None] * along, np.ones(len(along), dtype=bool)
+    fair = faired_outside_folds(rough, skin.faces, faired(rough, skin.faces, _kept(skin, shape), OF_RELIEF))
+    moved = eased(unflipped(fair, skin.faces, every), skin.faces, _plain(skin, shape), straight.vertices_m)
+    moved = unflipped(moved, skin.faces, every)
     displacement = np.einsum("vk,vk->v", moved - skin.vertices_m, along)
     return replace(skin, vertices_m=moved, relief_m=displacement, sigma_m=relief.sigma_m)
 

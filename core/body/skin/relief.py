@@ -63,6 +63,7 @@ REWEIGHTINGS = (0, 2)  # in each round
 SAMPLES = 32  # of the covariance: each sigma to 12 %
 UNMEASURED = 0.7  # of s: the sigma above which a vertex was hardly measured
 MIRRORED_M = 0.006  # by which the sides of a person differ
+HEADS = 0.5  # weight of the head in vertices that are the head's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -94,10 +95,13 @@ class _Observed:
     variance: np.ndarray  # (M,)
 
 
-def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints], mirror: bool, monitor: Monitor) -> Relief:
+def measured_relief(
+    skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints], mirror: bool, monitor: Monitor, straight: OneSkin | None = None
+) -> Relief:
     """The relief of a skin made in the rest pose of `shape`. 0.1 s a frame for a whole body, and 6 s.  (1)–(3)
 
-    With `mirror`, where a vertex was hardly measured it follows the mirror image of the other side, with its sigma and `MIRRORED_M`.
+    Where a vertex was hardly measured it follows the mirror image of the other side, with its sigma and `MIRRORED_M`: at the head always,
+    elsewhere with `mirror`. `straight` is the skin when it was symmetric, before its head was put in place.
 
     Raises:
         Cancelled: the monitor was cancelled.
@@ -118,8 +122,10 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
         seen = _Observed(**{name: np.concatenate([getattr(f, name) for f in found]) for name in _Observed.__slots__})
         delta, factor, weight = _adjusted(prior, nearby, seen, reweightings)
     sigma = _sigmas(factor, prior, seen, weight)
-    if mirror:
-        seen, weight = _mirrored(skin.vertices_m, normals, delta, sigma, size, seen, weight)
+    symmetric, may = straight or skin, mirror | (_share(shape, skin, (HEAD,)) > HEADS)
+    before, count = (symmetric.vertices_m, directions(symmetric, shape)), len(seen.d)
+    seen, weight = _mirrored(*before, may, delta, sigma, size, seen, weight)
+    if len(seen.d) > count:
         total, right = (np.bincount(seen.vertex, w, len(delta)) for w in (weight, weight * seen.d))
         factor = factorised(prior.T @ prior, total)
         delta, sigma = factor.solve(right), _sigmas(factor, prior, seen, weight)
@@ -235,14 +241,22 @@ def _adjusted(prior: "sparse.csc_matrix", nearby: "Nearby", seen: _Observed, rew
 
 
 def _mirrored(
-    vertices: np.ndarray, normals: np.ndarray, delta: np.ndarray, sigma: np.ndarray, size: np.ndarray, seen: _Observed, weight: np.ndarray
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    may: np.ndarray,
+    delta: np.ndarray,
+    sigma: np.ndarray,
+    size: np.ndarray,
+    seen: _Observed,
+    weight: np.ndarray,
 ) -> tuple[_Observed, np.ndarray]:
-    """The observations and those of measured vertices' mirror images (in the plane x = 0) at vertices that were hardly measured."""
+    """The observations and those of measured vertices' mirror images (in the plane x = 0) at vertices that were hardly measured and `may`
+    (V,) follow them."""
     from scipy.spatial import cKDTree
 
     flip = np.array([-1.0, 1.0, 1.0])
     distance, other = cKDTree(vertices).query(vertices * flip, distance_upper_bound=GATE * PRIOR_M)
-    there = np.flatnonzero(np.isfinite(distance))
+    there = np.flatnonzero(np.isfinite(distance) & may)
     other = other[there]
     there, other = (rows[(sigma[there] > UNMEASURED * size[there]) & (sigma[other] < UNMEASURED * size[other])] for rows in (there, other))
     places = (vertices + delta[:, None] * normals)[other] * flip
