@@ -83,7 +83,7 @@ def with_neck(shape: BodyShape, vertices: np.ndarray, faces: np.ndarray, weights
     names = [bone.name for bone in shape.skeleton.bones]
     if not {CHEST, NECK, HEAD} <= set(names):
         return weights
-    chest, neck, head = three = [names.index(name) for name in (CHEST, NECK, HEAD)]
+    chest, neck, head = three = np.array([names.index(name) for name in (CHEST, NECK, HEAD)])
     R, joint = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
     local = (vertices - joint[neck]) @ R[chest] / shape.lengths_m[chest]
     below, jaw = local[:, 1] + FALL * local[:, 2] < -COLLAR, weights[:, head] > JAWS
