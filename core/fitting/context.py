@@ -32,7 +32,7 @@ from .observations.shape_priors import proportions
 from .segmentation import SegmentationCache, segment, soft_segment
 from .settings import FitSettings
 from .solve.problem import Problem, Smoothness, robust_weights
-from .state import BodyState, ShapeParameters, free_bones, hand_bones
+from .state import BodyState, ShapeParameters, free_bones
 
 SUPPORT_SIGMA_M, SUPPORT_WIDTH = 0.005, 3.0  # of the weights by which poses are compared
 EXPLAINED_WIDTH_M = 0.015  # of a cell beyond a limb
@@ -212,7 +212,7 @@ class FitContext:
 
     def seen(self, t: int, points: CloudPoints) -> Evidence:
         """What is seen in frame index `t`, for a search."""
-        return Evidence.of(points, self.background.cells(t), self.settings.voxel_m, hand_bones(self.parameters))
+        return Evidence.of(points, self.background.cells(t), self.settings.voxel_m)
 
     def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """The `support` and the area of the person's cells that the body explains, less that of limbs in the background and half the

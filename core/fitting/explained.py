@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..body.skeleton import bone_frames, frames_of_bones
-from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
@@ -32,13 +31,12 @@ CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of
 UNSEEN = 0.2  # of a limb's area: rims of the rest of the body are no larger
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
 BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
-LARGEST, SHARED_FROM = 256, 64  # poses evaluated at once, and from which on threads share them
+LARGEST = 256  # poses evaluated at once; several threads gain nothing here
 FAR = 4.0  # widths, from where on nothing is explained
 EXPLAINED = 0.95  # of a point or cell: no limb is looked for there
 FACING = 0.3  # least cosine between a point's normal and the limb's
 PLACES = np.array([0.15, 0.4, 0.65, 0.9])  # along a bone, where it must not lie in the background
 CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other part
-FINGERS = 1.9  # a hand's reach over its bone's length, which ends at the knuckles
 BEHIND_M = 0.06  # a limb so far before measured points would hide them
 CELL_OF_DEPTH_M = 0.03
 LARGEST_PX = 1e6  # of an end of a bone in an image: in the plane of a camera a projection has no limit
@@ -83,12 +81,11 @@ class Evidence:
     cells: Sequence[PersonCells]  # of each view
     taken_cells: Sequence[np.ndarray]  # (M,) of each view
     voxel_m: float
-    reach: np.ndarray  # (B,) of each bone's flesh over its length
     depths: _NearestDepths | None  # of all points, in the middle view
 
     @staticmethod
-    def of(points: CloudPoints, cells: Sequence[PersonCells], voxel_m: float, hands: np.ndarray) -> "Evidence":
-        """The points, thinned, and the cells of all views; `hands` (B,): which bones end in fingers."""
+    def of(points: CloudPoints, cells: Sequence[PersonCells], voxel_m: float) -> "Evidence":
+        """The points, thinned, and the cells of all views."""
         every = 1 + (len(points.xyz_m) - 1) // MOST_POINTS if len(points.xyz_m) else 1
         thin = points.take(np.arange(0, len(points.xyz_m), every))
         return Evidence(
@@ -98,7 +95,6 @@ class Evidence:
             cells=cells,
             taken_cells=[np.zeros(len(view.xy_px)) for view in cells],
             voxel_m=voxel_m,
-            reach=np.where(hands, FINGERS, 1.0),
             depths=_NearestDepths.of(cells[len(cells) // 2].camera, thin.xyz_m) if cells and len(thin.xyz_m) else None,
         )
 
@@ -115,7 +111,7 @@ class Evidence:
         for view in self.cells:
             pixel, depth = view.camera.project(at[None])[0], float(view.camera.to_camera(at[None])[0, 2])
             around = view.take(np.linalg.norm(view.xy_px - pixel, axis=1) < reach * view.camera.focal_px / depth)
-            share = _cells_explained(around, state, rest, self.reach, TAKEN_CELLS_M)
+            share = _cells_explained(around, state, rest, TAKEN_CELLS_M)
             views.append(around.take(share < EXPLAINED))
             shares.append(share[share < EXPLAINED])
         points, area = self.points.take(close[left]), self.point_area * every
@@ -149,10 +145,10 @@ def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.nda
     others = _others(limb, state)
 
     def gains(rows: slice) -> np.ndarray:
-        capsules = _limb_capsules(evidence, limb, poses[rows], state)
+        capsules = _limb_capsules(limb, poses[rows], state)
         return _explained_by(evidence, capsules, state, width_m, UNSEEN) - _misplaced(evidence, capsules, state, others)
 
-    return np.concatenate(in_threads(gains, equal_pieces(len(poses), LARGEST, SHARED_FROM)))
+    return np.concatenate([gains(slice(i, i + LARGEST)) for i in range(0, max(len(poses), 1), LARGEST)])
 
 
 def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
@@ -160,22 +156,22 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
     state = parameters.state(poses[0], vector)
     R, head = bone_frames(parameters.skeleton, state.lengths_m, poses)
     bones = np.array(sorted(state.profiles))
-    body = _Capsules.of(evidence, state, bones, free_bones(parameters), head[:, bones], R[:, bones])
+    body = _Capsules.of(state, bones, free_bones(parameters), head[:, bones], R[:, bones])
     return _explained_by(evidence, body, state, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
 
 
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
     """The area of a body's limb that contradicts what is seen: the last sum of (3)."""
-    return float(_misplaced(evidence, _limb_capsules(evidence, limb, state.motion[None], state), state, _others(limb, state))[0])
+    return float(_misplaced(evidence, _limb_capsules(limb, state.motion[None], state), state, _others(limb, state))[0])
 
 
 def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, width_m: float) -> float:
     """The area of the person's cells that a body explains, less that of its `posed` (B,) bones in the background."""
     bones = np.array(sorted(state.profiles))
     middle = state.head_m[bones].mean(axis=0)
-    shares = [_cells_explained(view, state, bones, evidence.reach, width_m) for view in evidence.cells]
+    shares = [_cells_explained(view, state, bones, width_m) for view in evidence.cells]
     area = sum(evidence.cell_area(view, middle) * float(share.sum()) for view, share in zip(evidence.cells, shares))
-    body = _Capsules.of(evidence, state, bones, posed, state.head_m[None, bones], state.R[None, bones])
+    body = _Capsules.of(state, bones, posed, state.head_m[None, bones], state.R[None, bones])
     return area - float(_misplaced(evidence, body, state, np.zeros(0, np.intp))[0])
 
 
@@ -188,16 +184,16 @@ class _Capsules:
     axis: np.ndarray  # (N, K, 3) unit
     length_m: np.ndarray  # (K,)
     radii_m: np.ndarray  # (K, 2) at both ends
-    posed: np.ndarray  # (K,) whether its place counts: a bent hand lies anywhere
+    posed: np.ndarray  # (K,) whether its place counts: not that of bones with a firm prior
 
     @staticmethod
-    def of(evidence: Evidence, state: BodyState, bones: np.ndarray, posed: np.ndarray, head: np.ndarray, R: np.ndarray) -> "_Capsules":
+    def of(state: BodyState, bones: np.ndarray, posed: np.ndarray, head: np.ndarray, R: np.ndarray) -> "_Capsules":
         """Bones (K,) of a body, their frames `head` (N, K, 3) and R (N, K, 3, 3) in N poses; `posed` (B,)."""
         return _Capsules(
             bones=bones,
             first_m=head,
             axis=R[..., 1],
-            length_m=state.lengths_m[bones] * evidence.reach[bones],
+            length_m=state.lengths_m[bones],
             radii_m=np.array([[state.profiles[b].radii_m[i].mean() for i in (0, -1)] for b in bones.tolist()]),
             posed=posed[bones],
         )
@@ -214,10 +210,10 @@ class _Capsules:
         return np.asarray(self.radii_m[k, 0] + (self.radii_m[k, 1] - self.radii_m[k, 0]) * fraction)
 
 
-def _limb_capsules(evidence: Evidence, limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
+def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
     bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
     R, head = frames_of_bones(limb.parameters.skeleton, state.lengths_m, poses, bones)
-    return _Capsules.of(evidence, state, bones, free_bones(limb.parameters), head, R)
+    return _Capsules.of(state, bones, free_bones(limb.parameters), head, R)
 
 
 def _others(limb: Limb, state: BodyState) -> np.ndarray:
@@ -242,16 +238,12 @@ def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, 
     return _largest(rows, facing * _weight(gap, width_m), len(points.xyz_m))
 
 
-def _cells_explained(view: PersonCells, state: BodyState, bones: np.ndarray, reach: np.ndarray, width_m: float) -> np.ndarray:
+def _cells_explained(view: PersonCells, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:
     """The share (M,) of each of a view's cells that some bones of a body explain."""
     rows, bone = np.repeat(np.arange(len(view.xy_px)), len(bones)), np.tile(bones, len(view.xy_px))
-    head, axis, length = state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone]
-    further = (reach[bone] - 1) * length
     origin = np.broadcast_to(view.camera.centre_m, (len(rows), 3))
-    X = nearest_to_segment(origin, view.directions[rows], head, axis, length + further)
-    beyond = np.einsum("ni,ni->n", X - head, axis) - length
-    gap = gap_to_bone(X, state, bone) - np.clip(beyond, 0.0, further)
-    return _largest(rows, _weight(np.maximum(gap, 0.0), width_m), len(view.xy_px))
+    X = nearest_to_segment(origin, view.directions[rows], state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone])
+    return _largest(rows, _weight(np.maximum(gap_to_bone(X, state, bone), 0.0), width_m), len(view.xy_px))
 
 
 def _largest(rows: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:

@@ -267,12 +267,6 @@ def free_bones(parameters: "ShapeParameters") -> np.ndarray:
     return found & np.array([any(dof.prior_sigma > FIRM_PRIOR for dof in bone.dofs) for bone in bones])
 
 
-def hand_bones(parameters: "ShapeParameters") -> np.ndarray:
-    """Which bones (B,) end a limb with a firm prior of their pose: hands, whose bones end at the knuckles."""
-    free, parents = free_bones(parameters), parameters.skeleton.parents
-    return np.asarray(~free & free[parents] & ~np.isin(np.arange(len(free)), parents))
-
-
 class ShapeParameters:
     """A body model's shape as a vector (S,): from vectors to bodies and back. Weights are parameters only where that is asked for."""
 

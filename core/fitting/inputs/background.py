@@ -34,7 +34,7 @@ from ...take.take import FrameClicks
 from ..observations import BackgroundExclusion
 from ..observations.background import DistanceMap
 from ..settings import FitSettings
-from ..state import ShapeParameters, free_bones, hand_bones
+from ..state import ShapeParameters, free_bones
 from .fit_input import BackgroundDistances, FitInput, Packed
 
 FRACTIONS = (0.2, 0.5, 0.8, 1.0)  # of a bone's axis, where its places are
@@ -46,7 +46,6 @@ HALF = 0.5  # of a cell is the person's, if the cell is
 STILL = 0.25  # of a limb's line looks like the background, if the limb stands still
 NEAR_M = 0.025  # nothing so near to a measured point shows the background
 BAND = 0.5  # width of a clicked limb over the mean length of the limbs
-HAND_FRACTION, HAND_SIGMA = 0.5, 3.0  # of a hand's axis; its sigma over that of the outline
 CACHED_BYTES = 64_000_000  # of the frames whose distances are unpacked
 
 
@@ -72,12 +71,11 @@ class BackgroundRegions:
         skeleton = parameters.skeleton
         names = {joint: i for i, joint in enumerate(skeleton.joint_names)}
         free = free_bones(parameters)
-        places = [(bone, along, 1.0) for bone, observed in zip(skeleton.bones, free) if observed for along in FRACTIONS]
-        places += [(bone, HAND_FRACTION, HAND_SIGMA) for bone, last in zip(skeleton.bones, hand_bones(parameters)) if last and bone.dofs]
-        self._head = np.array([names[bone.head_joint] for bone, _, _ in places], dtype=np.intp)
-        self._tail = np.array([names[bone.tail_joint] for bone, _, _ in places], dtype=np.intp)
-        self._fraction = np.array([along for _, along, _ in places])
-        self._sigma_px = settings.background_sigma_px * np.array([wider for _, _, wider in places])
+        places = [(bone, along) for bone, observed in zip(skeleton.bones, free) if observed for along in FRACTIONS]
+        self._head = np.array([names[bone.head_joint] for bone, _ in places], dtype=np.intp)
+        self._tail = np.array([names[bone.tail_joint] for bone, _ in places], dtype=np.intp)
+        self._fraction = np.array([along for _, along in places])
+        self._sigma_px = settings.background_sigma_px
         self._given = given.background if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
         self._cells: dict[int, list[PersonCells]] = {}

@@ -60,7 +60,7 @@ class BackgroundExclusion(FromBlocks):
     head: np.ndarray  # (P,) index in Skeleton.joint_names
     tail: np.ndarray  # (P,)
     fraction: np.ndarray  # (P,)
-    sigma_px: np.ndarray  # (P,)
+    sigma_px: float
     kind: str = ""
     variance_inflation: np.ndarray | float = 1.0
     _last: list[tuple[BodyState, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]] = field(default_factory=list, init=False, repr=False)
@@ -83,7 +83,7 @@ class BackgroundExclusion(FromBlocks):
                 continue
             dX = state.joint_jacobian[1]
             dxyz = self._mix(dX[:, :, : state.layout.size(shape)], out)
-            across = (_pseudo_huber(d[out] / self.sigma_px[out])[1] / self.sigma_px[out])[:, None] * gradient[out]
+            across = (_pseudo_huber(d[out] / self.sigma_px)[1] / self.sigma_px)[:, None] * gradient[out]
             in_image = view.camera.project_with_jacobian(xyz[out])[1]
             yield k * len(self.head) + out, np.arange(dxyz.shape[2]), np.einsum("pa,pai,pik->pk", across, in_image, dxyz, optimize=True)
 

@@ -75,7 +75,7 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray) -
         angle = 2 * np.pi * k / HEADINGS
         turned = known.copy()
         turned[:, skeleton.layout[f"{skeleton.joint_names[0]} rotation"]] += angle
-        turned[:, skeleton.layout.group("base")], size = _places(region, *_flesh(rest, evidence, at_origin, angle))
+        turned[:, skeleton.layout.group("base")], size = _places(region, *_flesh(rest, at_origin, angle))
         poses.append(turned)
         stature.append(size)
     all_poses, sizes = np.concatenate(poses), np.concatenate(stature)
@@ -111,13 +111,11 @@ def _region(evidence: Evidence, camera: Camera) -> _Region:
     return _Region(camera=camera, middle_m=float(across.mean()), top_m=float(top) - half, bottom_m=float(bottom) + half, depth_m=depth)
 
 
-def _flesh(
-    rest: BodyState, evidence: Evidence, at_origin: tuple[np.ndarray, np.ndarray], angle: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _flesh(rest: BodyState, at_origin: tuple[np.ndarray, np.ndarray], angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places (N, S, 3) along the bones of poses at the origin that are turned by an angle, the flesh's radius there (S,) and its area."""
     R, head = at_origin
     turn, bones = axis_rotation("z", angle), np.array(sorted(rest.profiles))
-    lengths = rest.lengths_m[bones] * evidence.reach[bones]
+    lengths = rest.lengths_m[bones]
     radii = np.array([rest.profiles[b].radii_m[[0, -1]].mean() for b in bones.tolist()])
     X = head[:, bones][:, :, None] + (lengths[:, None] * ALONG)[..., None] * R[:, bones][:, :, None, :, 1]
     return X.reshape(len(head), -1, 3) @ turn.T, np.repeat(radii, len(ALONG)), np.repeat(lengths * radii, len(ALONG))

@@ -75,7 +75,7 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
     assert errors[1] < 0.5 * errors[0], errors
 
 
-def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly() -> None:
+def test_hands_keep_out_of_the_background_as_other_bones_do() -> None:
     parameters, far = ShapeParameters(default_shape(read_model("full"))), np.full((200, 250), 80, np.uint8)
     empty = [BackgroundDistances(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
     given = FitInput(
@@ -83,11 +83,10 @@ def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly
     )
     seen = BackgroundRegions(given, parameters, FitSettings(background_sigma_px=4.0)).observe(0)[0]
     joints = np.array(parameters.skeleton.joint_names)
-    hands = seen.sigma_px > 4.0
-    assert sorted(joints[seen.head[hands]]) == ["wrist.L", "wrist.R"]
-    assert (seen.sigma_px[hands] == 12.0).all() and (seen.fraction[hands] == 0.5).all() and (seen.sigma_px[~hands] == 4.0).all()
+    hands = np.isin(joints[seen.head], ["wrist.L", "wrist.R"])
+    assert seen.fraction[hands].tolist() == [0.2, 0.5, 0.8, 1.0] * 2 and seen.sigma_px == 4.0
     r = seen.residual(parameters.state(np.zeros(len(parameters.skeleton.dofs)), parameters.vector()))
-    assert (0 < r[hands]).all() and (r[hands] < 0.6 * r.max()).all()  # hands and arms are 40 px outside, each
+    assert (r[hands] > 0).all()  # they are 40 px outside
 
 
 def test_regions_of_many_frames_are_unpacked_within_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:

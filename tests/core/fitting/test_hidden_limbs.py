@@ -22,7 +22,7 @@ from tricap.core.foundation.progress import Monitor
 
 from .limb_scene import front_rig, measured_cloud, surface
 
-WRIST = "wrist.R"
+WRIST, HAND = "wrist.R", ("wrist.R flexion", "wrist.R deviation")
 
 
 def points_of(shape, motion: np.ndarray, bones: dict[str, int]) -> CloudPoints:
@@ -58,7 +58,7 @@ def test_a_raised_arm_is_found(standing) -> None:
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (raised, before, found))
     assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm(now - true) < 0.08
     moved = np.flatnonzero(np.abs(found - before) > 1e-9)
-    assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in moved} <= {"shoulder.R", "elbow.R"}
+    assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in moved} <= {"shoulder.R", "elbow.R", "wrist.R"}
     assert not reacquired_poses(fit, 0, points_of(shape, raised, others), before, vector)  # hidden: nothing is invented
     unsought = replace(fit, settings=replace(fit.settings, search_limbs=False))
     seen = points_of(shape, raised, others | {"upper_arm.R": 80, "forearm.R": 80})
@@ -86,7 +86,7 @@ def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (bent, before, found))
     assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm(now - true) < 0.08
     moved = np.flatnonzero(np.abs(found - before) > 1e-9)
-    assert {shape.skeleton.dof_names[i] for i in moved} <= {"shoulder.R twist", "elbow.R flexion", "elbow.R twist"}
+    assert {shape.skeleton.dof_names[i] for i in moved} <= {"shoulder.R twist", "elbow.R flexion", "elbow.R twist", *HAND}
     assert not reacquired_poses(fit, 0, points_of(shape, bent, seen), before, vector)
 
 
@@ -156,6 +156,18 @@ def test_the_foot_of_one_who_squats_is_found_flat_on_the_floor(standing) -> None
     (found,) = reacquired_poses(fit, 0, points_of(shape, squatting, seen | {"foot.R": 80}), before, fit.parameters.vector(shape))
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["toe.R"] for m in (squatting, before, found))
     assert np.linalg.norm(was - true) > 0.09 and np.linalg.norm(now - true) < 0.03
+
+
+def test_a_hand_is_found_where_the_wrist_is_bent(standing) -> None:
+    fit, shape, straight = standing
+    bent = straight.copy()
+    bent[shape.skeleton.layout["wrist.R flexion"]] = np.radians(-65.0)
+    body = ("chest", "spine", "thigh.R", "shin.R", "thigh.L", "shin.L", "upper_arm.R", "forearm.R", "upper_arm.L", "forearm.L")
+    points = points_of(shape, bent, dict.fromkeys(body, 60) | {"hand.R": 80})
+    (found,) = reacquired_poses(fit, 0, points, straight, fit.parameters.vector(shape))
+    true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["knuckles.R"] for m in (bent, straight, found))
+    assert np.linalg.norm(was - true) > 0.08 and np.linalg.norm(now - true) < 0.03
+    assert not reacquired_poses(fit, 0, points, bent, fit.parameters.vector(shape))
 
 
 def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> None:

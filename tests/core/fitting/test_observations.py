@@ -96,7 +96,7 @@ def _empty(camera: Camera, joints: int, rng) -> BackgroundExclusion:
         head=np.arange(joints),
         tail=(np.arange(joints) + 1) % joints,
         fraction=rng.uniform(0.1, 0.9, joints),
-        sigma_px=np.linspace(2.0, 6.0, joints),
+        sigma_px=4.0,
     )
 
 
