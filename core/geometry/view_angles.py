@@ -29,10 +29,14 @@ def views_alike(cameras: Sequence[Camera], reference: int) -> list[int]:
     return [k for k in others if degrees[k] <= WIDEST_DEG] or others
 
 
+def neighbours_deg(cameras: Sequence[Camera], reference: int) -> np.ndarray:
+    """The angles (K − 1,) to the other views, ascending."""
+    return np.sort(np.delete(axis_angles_deg(cameras, reference), reference))
+
+
 def second_neighbour_deg(cameras: Sequence[Camera], reference: int) -> float:
     """The angle to the second nearest of the other views; of two views, the angle between them."""
-    others = np.sort(np.delete(axis_angles_deg(cameras, reference), reference))
-    return float(others[: min(2, len(others))][-1])
+    return float(neighbours_deg(cameras, reference)[:2][-1])
 
 
 def default_reference(names: Sequence[str], rig: Rig | None = None) -> str:

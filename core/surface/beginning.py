@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..foundation.progress import Monitor
-from ..geometry.view_angles import views_alike
+from ..geometry.view_angles import WIDEST_DEG, neighbours_deg
 from ..results.folder import Results
 from ..take.footage import Footage
 from .measure import NothingMeasured, measure_frames
@@ -37,15 +37,18 @@ class Beginning:
 
 
 def other_beginning(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Beginning | None:
-    """Where to begin if the first frame shows nothing; None if there is nothing in the other frames that were tried, either.
+    """Where to begin if the first frame shows nothing; None if there is nothing in the other frames that were tried, either, or if every
+    other view looks from too far apart from the reference view.
 
     Raises:
         InputError: the images cannot be read.
         Cancelled: the user asked to stop.
     """
-    first = first_frame(footage)
+    first, degrees = first_frame(footage), neighbours_deg(footage.rig.cameras, footage.take.reference)
+    if degrees[0] > WIDEST_DEG:
+        return None
     frames = _others(footage, settings, first)
-    can_pair = len(views_alike(footage.rig.cameras, footage.take.reference)) > 1 and not settings.growing.pairs
+    can_pair = len(degrees) > 1 and degrees[1] <= WIDEST_DEG and not settings.growing.pairs
     parts = len(frames) + can_pair * (1 + len(frames))
     tried = [_tried(footage, settings, results, frame, monitor.part("surface", i, parts)) for i, frame in enumerate(frames)]
     best = max(tried, key=lambda one: one.points, default=Beginning(frame=first, points=0, pairs=False))

@@ -117,3 +117,9 @@ def test_the_run_and_the_check_report_the_reference_view(plane_take: Path, tmp_p
     assert (open_take(read_take(take)).take.reference_view, open_take(read_take(take)).reference_note) == ("R", "")
     (take / "take.toml").write_text(text)
     assert open_take(read_take(take)).reference_note == ""
+
+
+def test_nothing_else_is_tried_where_no_view_looks_from_nearby(tmp_path: Path, scenes: Any, plane: Any) -> None:
+    rig = Rig(cameras=(far_camera(scenes, scenes.depth_m), scenes.three_cameras()["C"]))
+    take = scenes.write_take(tmp_path / "take", rig, [[plane], [plane]])
+    assert begun(take, tmp_path / "out", COARSE) is None
