@@ -6,6 +6,7 @@ import bpy
 from mathutils import Vector
 
 from ...core.foundation.errors import InputError
+from ...core.geometry.view_angles import default_reference
 from .. import project
 from ..clicking.open_views import NO_WINDOW, REVIEW, close_others, go_to, lay_out_soon, show_clip
 from ..overlay import canvas
@@ -32,6 +33,7 @@ class Review(bpy.types.Operator):
         window = context.window
         try:
             clips = project.clips_of(context.scene)
+            default = default_reference([*clips], project.rig_of(context.scene))
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -40,8 +42,8 @@ class Review(bpy.types.Operator):
             return {"CANCELLED"}
         go_to(window, REVIEW)
         context.scene.tricap_overlay.body = True
-        middle, chosen = [*clips][len(clips) // 2], context.scene.tricap.reference_view
-        name = clips[chosen if chosen in clips else middle].name
+        chosen = context.scene.tricap.reference_view
+        name = clips[chosen if chosen in clips else default].name
         lay_out_soon(window, REVIEW, lambda: lay_out(window, name))
         return {"FINISHED"}
 

@@ -82,6 +82,8 @@ def run_and_read(
 def report_run(operator: Any, context: bpy.types.Context, run: "Run") -> None:
     """Show a run's warnings and its summary, and store the summary for the panel."""
     context.scene.tricap.last = str(run)
+    if run.footage.reference_note:
+        operator.report({"INFO"}, run.footage.reference_note)
     for sentence in run.record["warnings"]:
         operator.report({"WARNING"}, sentence)
     operator.report({"INFO"}, str(run))

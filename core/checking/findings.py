@@ -34,6 +34,7 @@ class Cause(StrEnum):
     OVEREXPOSED = "overexposed"
     POOR_CALIBRATION = "poor calibration"
     RAYS_MISS = "rays miss"
+    REFERENCE_VIEW = "reference view"
     REPEATED_FRAMES = "repeated frames"
     ROLLING_SHUTTER = "rolling shutter"
     SAME_PLACE = "same place"

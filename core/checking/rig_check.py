@@ -18,6 +18,7 @@ from ..foundation.errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
+from ..geometry.view_angles import WIDEST_DEG, axis_angles_deg
 from ..take.take import Take
 from .findings import Cause, Checked, Finding, doubtful, wrong
 from .view_matches import PairMatches
@@ -25,7 +26,6 @@ from .view_matches import PairMatches
 FOCAL = (0.4, 12.0)  # of the image's longer side: 103° and 5° of view
 OFF_CENTRE = 0.2  # of the image's longer side
 FAR_APART_M = 100.0  # longer than any hall
-WIDEST_DEG = 45.0  # between the axes of two views whose patches still look alike
 SAME_PLACE = 0.005  # of the longest base
 MOST_COMPARED = 40  # cameras, each with every other one
 LARGE_SIGMA0_PX = 1.0
@@ -74,8 +74,7 @@ def geometry_findings(rig: Rig) -> list[Finding]:
 
 def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
     """Views that look from too far apart for patches to be matched: those that a point needs besides the reference view."""
-    ahead = np.array([camera.R_cam_world[2] for camera in cameras])
-    degrees = np.degrees(np.arccos(np.clip(ahead @ ahead[reference], -1.0, 1.0)))
+    degrees = axis_angles_deg(cameras, reference)
     others = sorted((k for k in range(len(cameras)) if k != reference), key=lambda k: degrees[k])[: min(2, len(cameras) - 1)]
     if degrees[others[-1]] <= WIDEST_DEG:
         return []

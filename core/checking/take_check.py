@@ -29,7 +29,7 @@ from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
 from ..take.take import Take, read_take
-from .findings import Cause, Checked, Finding, doubtful, wrong
+from .findings import Cause, Checked, Finding, doubtful, remark, wrong
 from .openings import opening_findings
 from .rig_check import (
     FEWEST_MATCHES,
@@ -254,6 +254,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     findings = [
         *geometry_findings(footage.rig),
         *wide,
+        *([remark(Cause.REFERENCE_VIEW, footage.reference_note)] if footage.reference_note else []),
         *picture_findings(film.survey, names),
         *rate_findings(footage),
         *gap_findings(footage),

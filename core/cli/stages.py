@@ -146,7 +146,8 @@ def _films(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> li
 def _summary(job: take_run.Run, as_json: bool) -> list[str]:
     if as_json:
         return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
-    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.record["warnings"])]
+    notes = [note for note in (job.footage.reference_note, *job.record["warnings"]) if note]
+    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in notes)]
 
 
 def _names_of(parser: argparse.ArgumentParser) -> list[str]:

@@ -135,7 +135,7 @@ def _blank(field: MatchedField, cell: np.ndarray, views: Views) -> MatchedField:
     return replace(
         field,
         cell=cell,
-        xy=np.zeros((n, K, 2)),
+        xy=np.full((n, K, 2), np.nan),
         shape=shape,
         covariance=np.zeros((n, K, 2, 2)) + field.covariance[:1, views.reference, None],
         correlation=np.zeros(n),

@@ -136,7 +136,7 @@ class _Cells:
         cells = grid.shape[0] * grid.shape[1]
         self.grid = grid
         self.centre = np.zeros((cells, views, 2))  # of the patches; the starts of the neighbours follow from it
-        self.xy = np.zeros((cells, views, 2))
+        self.xy = np.full((cells, views, 2), np.nan)
         self.shape = np.zeros((cells, views, 2, 2))
         self.covariance = np.zeros((cells, views, 2, 2))
         self.correlation, self.residual, self.sigma0 = np.zeros(cells), np.zeros(cells), np.zeros(cells)
@@ -152,6 +152,7 @@ class _Cells:
         xy = self.grid.xy(cell)
         self.accepted[cell] = True
         self.centre[cell, reference], self.xy[cell, reference] = xy, xy + matched[0].offset
+        self.shape[cell] = front.shape  # also in views that are not matched
         self.shape[cell, reference], self.spread[cell] = np.eye(2), matched[0].spread
         self.covariance[cell, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
         for k, m in zip(views.search, matched):
@@ -266,7 +267,7 @@ def grow_regions(
     growth = _Growth(views, grid, growing, first, foreground, monitor)
     larger = rounds_of_larger_patches(matching, growing, first.depth_m, views.base)
     levels = (*range(larger + 1), NARROW)
-    for pairs, level in product((False, True) if growing.pairs and len(views.cameras) > 2 else (False,), levels):
+    for pairs, level in product((False, True) if growing.pairs and len(views.search) > 1 else (False,), levels):
         growth.run(_round(views, matching, level, pairs), seed_front, with_seeds=level == 0, restart=bool(level or pairs))
     return growth.cells.field(growth.limit_px)
 

@@ -24,7 +24,9 @@ from .least_squares import MatchingSettings
 from .patches import patch_offsets
 from .views import TemplateGrid, Views
 
-NEAREST_BASES = 0.8  # nearest depth of the sweep, in lengths of the longest base, where nothing else limits it
+NEAREST_BASES = (
+    0.8  # nearest depth of the sweep, in lengths of the longest base of the views that are matched, where nothing else limits it
+)
 FARTHEST_BASES = 40.0  # farthest depth
 SWEEP_STEP_PX = 1.0  # px of the fastest search image from sample to sample
 MIN_SCORE = 0.80  # of (1)
@@ -97,7 +99,7 @@ def sweep_seeds(
         xy = xy[((xy >= within_px[0]) & (xy <= within_px[1])).all(axis=1)]
     xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
-    near, far = depth_range_m or _default_range(views.cameras)
+    near, far = depth_range_m or _default_range([views.base, *(views.cameras[k] for k in views.search)])
     inverse = _inverse_depths(views, near, far)
 
     def work(part: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +120,7 @@ def sweep_ray(views: Views, xy: np.ndarray, settings: MatchingSettings, depth_ra
     at = _textured(views, settings, np.asarray(xy, dtype=np.float64)[None])
     if not len(at):
         return None
-    inverse = _inverse_depths(views, *(depth_range_m or _default_range(views.cameras)))
+    inverse = _inverse_depths(views, *(depth_range_m or _default_range([views.base, *(views.cameras[k] for k in views.search)])))
     depth, good = _best_depths(_sweep_correlations(views, settings, at, inverse), inverse, len(views.search))
     return float(depth[0]) if good[0] else None
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..foundation.threads import in_threads
 from ..geometry.camera import Camera
+from ..geometry.view_angles import views_alike
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
 
@@ -34,12 +35,12 @@ class Views:
 
     @property
     def search(self) -> list[int]:
-        """The numbers of the search views, in the order of the cameras."""
-        return [k for k in range(len(self.cameras)) if k != self.reference]
+        """The numbers of the search views, in the order of the cameras; without those that look from too far apart to be matched."""
+        return views_alike(self.cameras, self.reference)
 
     def required_matches(self, pairs: bool) -> int:
         """How many search views must match a point: two, or all there are; with `pairs` one."""
-        return 1 if pairs else min(2, len(self.cameras) - 1)
+        return 1 if pairs else min(2, len(self.search))
 
     def select(self, numbers: Sequence[int]) -> "Views":
         """Only these views; the first one becomes the reference."""

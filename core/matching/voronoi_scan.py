@@ -272,7 +272,7 @@ def _merged(scans: Sequence[_Scan], views: Views, grid: TemplateGrid, growing: G
     count = np.sum([s.found for s in scans], axis=0)
     cell = np.flatnonzero(count >= views.required_matches(growing.pairs))
     n = len(cell)
-    xy, shape, K = np.zeros((n, len(cameras), 2)), np.zeros((n, len(cameras), 2, 2)), np.zeros((n, len(cameras), 2, 2))
+    xy, (shape, K) = np.full((n, len(cameras), 2), np.nan), (np.tile(np.eye(2), (n, len(cameras), 1, 1)) for _ in range(2))
     matched = np.stack([s.found[cell] for s in scans])
     offset = np.sum([s.offset[cell] * f[:, None] for s, f in zip(scans, matched)], axis=0) / count[cell, None]
     xy[:, reference], shape[:, reference], K[:, reference] = grid.xy(cell) + offset, np.eye(2), np.eye(2) * TEMPLATE_SIGMA_PX**2

@@ -308,7 +308,7 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
         f'<h1>{take}</h1><p class="verdict">{html.escape(verdict(record, report.body, len(report.doubtful)))}</p>'
         f'<p class="soft">{html.escape(facts)}</p>'
         + (f'<div class="row cells">{cells}</div><p class="soft">{LEGEND}</p>' if cells else "")
-        + notes(record["warnings"])
+        + notes([*filter(None, [record.get("reference_note")]), *record["warnings"]])
         + _limbs(report.body)
         + f'{shown}<p class="soft">{AXES}</p><h2>Over time</h2><p class="soft">Point at a curve to read it, drag over '
         "a range to enlarge it, double-click to see all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"

@@ -10,6 +10,7 @@ from ..foundation.errors import InputError
 FORMAT, VERSION = "tricap-run", 1
 FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
+    "reference_note": str,
 }  # fmt: skip
 STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),

@@ -39,6 +39,7 @@ from ..motion.tables import write_joints, write_motion
 from ..report.pages import Report, write_report
 from ..report.silhouettes import by_view, silhouettes_of
 from ..results.folder import FitCheckpoints
+from ..surface.beginning import other_beginning
 from ..surface.cloud import as_written, write_cloud
 from ..surface.frames import FrameSummary, MeasuredFrames, summary_of
 from ..surface.measure import NothingMeasured, measure_frames
@@ -75,7 +76,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         with run.resumable(
             stopped=lambda: f"Stopped: the surface of {len(summaries)} of {len(frames)} frames is kept; run it again to go on."
         ):
-            foreground = _measure_frames(run, summaries, monitor)
+            foreground = _measured_from_somewhere(run, summaries, monitor)
     except NothingMeasured as error:
         return _no_surface(run, error, monitor)
     summaries.sort(key=lambda summary: summary.frame)
@@ -192,12 +193,28 @@ def is_complete(run: Run) -> bool:
 # ---- the steps of the stages ---------------------------------------------------------------------------------------------
 
 
+def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
+    """As `_measure_frames`; if the first frame shows nothing and no certain cause is found, from another one, or with pairs of views."""
+    try:
+        return _measure_frames(run, summaries, monitor)
+    except NothingMeasured as error:
+        if any(cause.certain for cause in causes_of_failure(run.footage, monitor)):
+            raise
+        begin = other_beginning(run.measured_footage, MeasureSettings.of(run.settings), run.results, monitor)
+        if begin is None:
+            raise
+        run.warn(begin.sentence(error.frame))
+        run.begin, growing = begin.frame, run.settings["growing"]
+        run.settings["growing"] = replace(growing, pairs=growing.pairs or begin.pairs)
+        return _measure_frames(run, summaries, monitor)
+
+
 def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
     """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground."""
     s, foreground = run.settings, None
     if run.engine is not None:
         measure_at_once(run, run.engine, monitor)
-    for m in measure_frames(run.measured_footage, MeasureSettings.of(s), run.results, monitor):
+    for m in measure_frames(run.measured_footage, MeasureSettings.of(s), run.results, monitor, run.begin):
         write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
         summaries.append(summary_of(m))
         foreground = foreground or m.foreground

@@ -37,6 +37,7 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
         "interlaced": take.interlaced,
         "views": [v.name for v in take.views],
         "reference_view": take.reference_view,
+        "reference_note": footage.reference_note,
         "model": take.body_model,
         "settings": {name: to_table(value) for name, value in settings.items()},
         "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},

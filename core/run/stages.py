@@ -43,7 +43,8 @@ def _measure_input(footage: Footage) -> Any:
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
     person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
-    swept = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
+    swept: tuple[float | str, ...] = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
+    swept += footage.unlike_views
     return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, starts.ALGORITHM, *swept
 
 

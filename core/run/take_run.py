@@ -41,6 +41,7 @@ class Run:
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
+    begin: int | None = None  # the frame from which the surface is measured, if not the usual one (`surface.beginning`)
     surfaceless: bool = False  # nothing could be measured, or nothing is to be
     silhouettes: Silhouettes = field(default_factory=Silhouettes)
     engine: Engine | None = None  # where the frames are measured; None: in this process

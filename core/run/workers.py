@@ -47,11 +47,12 @@ def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
     settings, footage = MeasureSettings.of(run.settings), run.measured_footage
     if engine.scheduler is None and len(footage.frames) < FEWEST:
         return
-    starts = FrameStarts(footage, settings, run.results)
+    starts = FrameStarts(footage, settings, run.results, run.begin)
     if not starts.alone:
         return
     steps = 1 + len(starts.order)
-    next(measure_frames(footage, settings, run.results, monitor.part("seeds", 0, steps)))  # fails early where nothing can be measured
+    first = measure_frames(footage, settings, run.results, monitor.part("seeds", 0, steps), run.begin)
+    next(first)  # fails early where nothing can be measured
     waiting, least = list[tuple[int, str]](), FEWEST if engine.scheduler is None else 1
     with _running(engine) as submit:
         work = list[Any]()

@@ -59,14 +59,16 @@ class MeasuredFrame:
         return self if own.all() else replace(self, field=self.field.select(own), cloud=self.cloud.select(own))
 
 
-def measure_frames(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Iterator[MeasuredFrame]:
-    """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
+def measure_frames(
+    footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor, first: int | None = None
+) -> Iterator[MeasuredFrame]:
+    """Measure all frames: from the first one (by default that of the clicks) to the end, then from it to the beginning.
 
     Raises:
         InputError: the images cannot be read.
         NothingMeasured: nothing of a person can be measured in the first frame.
     """
-    starts = FrameStarts(footage, settings, results)
+    starts = FrameStarts(footage, settings, results, first)
     for done, frame in enumerate(starts.order):
         part = monitor.part("surface", done, len(starts.order))
         part.step("surface", 0, 1)

@@ -53,13 +53,19 @@ class FrameStart:
     field: MatchedField | None = None  # of the frame, where the seeds of the next one come from it
 
 
-class FrameStarts:
-    """The starts of a take's frames: from the frame of the clicks to the end, then from it to the beginning (`order`)."""
+def first_frame(footage: Footage) -> int:
+    """The frame from which the others are measured: that of the clicks, or else the first of the take."""
+    clicked = footage.take.clicks.frame
+    return clicked if clicked in footage.frames else footage.frames.start
 
-    def __init__(self, footage: Footage, settings: "MeasureSettings", results: Results) -> None:
+
+class FrameStarts:
+    """The starts of a take's frames: from the `first` one to the end, then from it to the beginning (`order`)."""
+
+    def __init__(self, footage: Footage, settings: "MeasureSettings", results: Results, first: int | None = None) -> None:
         self._footage, self._settings, self._results = footage, settings, results
         take = footage.take
-        self.first = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
+        self.first = first_frame(footage) if first is None else first
         self.order = [*range(self.first, footage.frames.stop), *range(self.first - 1, footage.frames.start - 1, -1)]
         self._base = store.digest(
             ALGORITHM,
@@ -71,6 +77,7 @@ class FrameStarts:
             + (repr([clock.digest() for clock in footage.clocks]) if footage.clocks else ""),
             repr(footage.click_sigma_px) if take.clicks.surface else "",
             repr(footage.reduction.tolist()) if footage.full_size_px else "",
+            "".join(f" not matched {name}" for name in footage.unlike_views),
         )
         self._of_first: FrameStart | None = None
         self._before: FrameStart | None = None

@@ -80,6 +80,7 @@ def synchronise(take: Take, monitor: Monitor, movie_sound: MovieSound | None = N
         InputError: a sound or an image cannot be read.
         Cancelled: the monitor was cancelled.
     """
+    take = replace(take, reference_chosen=True)  # the same view in all steps, also in those that open the footage
     sounds = {v.name: _sound(take, v, movie_sound) for v in take.views}
     reference = take.views[take.reference]
     timings = {reference.name: _timing(reference, reference.start_s, 0.0, reference.drift_ppm, "reference")}

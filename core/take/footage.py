@@ -11,6 +11,7 @@ from ..foundation.errors import InputError
 from ..foundation.threads import in_threads
 from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
+from ..geometry.view_angles import default_reference, second_neighbour_deg, views_alike
 from ..images.retime import Recent
 from ..images.sequence import ImageSequence, open_sequence
 from .clock import Clock, clocks_of
@@ -31,6 +32,26 @@ class Footage:
     clocks: tuple[Clock, ...] = ()  # of the views; empty where they are shifted by whole frames at most
     delay_images: tuple[float, ...] = ()  # time offset by which the images of each view are interpolated; empty: none
     full_size_px: tuple[tuple[int, int], ...] = ()  # of the views' images, where they are reduced to the cameras' size; else empty
+
+    @property
+    def reference_note(self) -> str:
+        """Which view is the reference view and why, where the cameras decided that and not take.toml; else empty."""
+        take, middle = self.take, len(self.take.views) // 2
+        if take.reference_chosen or take.reference == middle:
+            return ""
+        own, other = (second_neighbour_deg(self.rig.cameras, k) for k in (take.reference, middle))
+        return (
+            f"The reference view is {take.reference_view}, not {take.views[middle].name} in the middle of the list: two other views look "
+            f"from within {own:.0f}° of it, and of {take.views[middle].name} from within {other:.0f}°. `reference_view` in take.toml names "
+            "another one."
+        )
+
+    @property
+    def unlike_views(self) -> tuple[str, ...]:
+        """The names of the views that are not matched, as they look from too far apart from the reference view."""
+        reference = self.take.reference
+        matched = (reference, *views_alike(self.rig.cameras, reference))
+        return tuple(view.name for k, view in enumerate(self.take.views) if k not in matched)
 
     def number(self, view: int, frame: int) -> int:
         """The number of the image in a view's sequence that shows a frame of the take."""
@@ -162,6 +183,7 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
     """
     rig = read_rig(take.rig_path)
     rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata)
+    take = take if take.reference_chosen else replace(take, reference_view=default_reference([v.name for v in take.views], rig))
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     frames, clocks = footage_frames(take, sequences), clocks_of(take, sequences)
     if clocks:

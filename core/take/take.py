@@ -15,6 +15,7 @@ from ..foundation.arrays import frozen
 from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
 from ..geometry.rig import MOST_CAMERAS
+from ..geometry.view_angles import default_reference
 from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
 from .clock import KEYS as CLOCK_KEYS
 from .clock import view_clock
@@ -148,6 +149,7 @@ class Take:
     interlaced: str = "none"
     first_field: str = "odd"  # of "both"
     reference_view: str = ""
+    reference_chosen: bool = True  # by take.toml; otherwise it is the middle one, and `open_take` may take another
     frames: tuple[int, int] | None = None
     body_model: str | None = None  # the name of one of ours, or the absolute path of the take's own; None: no body
     no_body: bool = False  # the take asks for surface and tracks only: model = "none"
@@ -229,7 +231,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         raise InputError(f'{where} must have format = "{FORMAT}" and version = {VERSION}; {present}.')
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)
-    reference = table.get("reference_view", names[len(names) // 2])
+    reference = table.get("reference_view", default_reference(names))
     if reference not in names:
         raise InputError(f"`reference_view` of {where} is {shown(reference)}.{nearest_name(str(reference), names)}")
     interlaced = table.get("interlaced", "none")
@@ -255,6 +257,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         interlaced=interlaced,
         first_field=first_field,
         reference_view=reference,
+        reference_chosen="reference_view" in table,
         frames=frame_pair(table.get("frames"), where),
         body_model=body_model(folder, body.get("model"), where),
         no_body=body.get("model") == NO_BODY,

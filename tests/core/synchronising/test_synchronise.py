@@ -145,6 +145,17 @@ def test_without_sound_the_rays_alone_are_enough_where_somebody_moves(loose: Pat
     assert abs(timings[2].start_s - 1 / 60) < 1.2e-3 and abs(timings[0].start_s) < 1.2e-3 and timings[2].sigma_s < 1e-3
 
 
+def test_all_steps_have_the_same_reference_view(loose: Path) -> None:
+    """R, the middle of the list, although opened footage has C as its reference view."""
+    take = read_take(loose)
+    left, centre, right = take.views
+    take = replace(take, views=(left, right, centre), reference_view="R", reference_chosen=False)
+    assert open_take(replace(take, clicks=FrameClicks(), frames=None)).take.reference_view == "C"
+    timings = synchronise(take, Monitor())
+    assert [t.method for t in timings] == ["rays", "reference", "rays"]
+    assert abs(timings[0].start_s + 1 / 60) < 1.2e-3 and abs(timings[2].start_s + 1 / 60) < 1.2e-3
+
+
 @pytest.mark.parametrize(
     ("samples", "said"),
     [
