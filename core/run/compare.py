@@ -24,6 +24,7 @@ from .settings import Overrides
 from .take_run import open_run
 
 PLACE_M = 0.02  # edge of the cubes in which coverage is counted
+SURFACE, TRACKS, BODY, TIME = "Surface", "Trajectories", "Body", "Time"  # groups of measures
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 
@@ -74,16 +75,16 @@ def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
         return 100 * (1 - track.get("reasons", {}).get("measured", 0) / started) if started else float("nan")
 
     wanted = (
-        ("points a frame", "", HIGHER, lambda s: s.get("measure", {}).get("points_per_frame")),
-        ("residual of the rays (median)", "px", NEITHER, lambda s: s.get("measure", {}).get("residual_px")),
-        ("trajectories", "", NEITHER, lambda s: s.get("track", {}).get("trajectories")),
-        ("length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
-        ("trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
-        ("reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
-        ("duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
+        (SURFACE, "points a frame", "", HIGHER, lambda s: s.get("measure", {}).get("points_per_frame")),
+        (SURFACE, "residual of the rays (median)", "px", NEITHER, lambda s: s.get("measure", {}).get("residual_px")),
+        (TRACKS, "trajectories", "", NEITHER, lambda s: s.get("track", {}).get("trajectories")),
+        (TRACKS, "length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
+        (TRACKS, "trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
+        (BODY, "reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
+        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
     )
     values = [[float(v) if (v := of(run["stages"])) is not None else float("nan") for run in runs] for *_, of in wanted]
-    return [Measure(name=n, unit=u, published=a, default=b, better=c) for (n, u, c, _), (a, b) in zip(wanted, values)]
+    return [Measure(group=g, name=n, unit=u, published=a, default=b, better=c) for (g, n, u, c, _), (a, b) in zip(wanted, values)]
 
 
 def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
@@ -102,8 +103,10 @@ def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
     columns = np.array([share, noise]).reshape(2, -1, 2)
     (a, b), (c, d) = ([finite_median(table[:, k]) for k in (0, 1)] for table in columns)
     return [
-        Measure(name="coverage of the places that either measured", unit="%", published=a, default=b, better=HIGHER),
-        Measure(name="noise of a point about the surface through its neighbours", unit="mm", published=c, default=d, better=LOWER),
+        Measure(group=SURFACE, name="coverage of the places that either measured", unit="%", published=a, default=b, better=HIGHER),
+        Measure(
+            group=SURFACE, name="noise of a point about the surface through its neighbours", unit="mm", published=c, default=d, better=LOWER
+        ),
     ]
 
 

@@ -63,11 +63,11 @@ def cloud(n: int) -> PointCloud:
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_clouds_are_drawn(scenes: Any, n: int) -> None:
     camera, c = scenes.three_cameras()["C"], cloud(n)
-    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 0.0, 1.0)
+    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 1.0, "sigma, mm")
     assert over.shape == (150, 200, 3) and over.dtype == np.uint8
     assert (np.ptp(over, axis=2) > 0).any() == (n > 0)  # colour is what is measured
     front_and_side = pictures.cloud_views(c, camera, 4)
-    assert front_and_side.shape == (pictures.PANEL_PX, 2 * pictures.PANEL_PX, 3)
+    assert front_and_side.shape == (pictures.PANEL_PX, 2 * (pictures.NARROW_PX if n == 1 else pictures.PANEL_PX), 3)
     assert front_and_side.max() > 28 if n else True
 
 
