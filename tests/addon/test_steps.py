@@ -480,7 +480,7 @@ def test_the_untouched_cube_makes_room(blender: ModuleType) -> None:
         for name, value in change.items():
             setattr(cube, name, value)
         blender.context.view_layer.update()
-        aside._hide_default_objects(operator, blender.context)
+        aside.hide_default_objects(operator, blender.context)
         found = bool(cube.hide_get())
         assert cube.hide_render == found
         blender.data.objects.remove(cube)
