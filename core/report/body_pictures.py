@@ -14,12 +14,15 @@ from .silhouettes import OUTLINE, PERSON, Silhouettes
 
 
 class BodyPictures:
-    """The pictures of a body in the frames `chosen` (indices of its motion), in windows of one size in each view; none without a body."""
+    """The pictures of a body in the frames `chosen` (indices of its motion), as close-ups (`near`) or whole images; none without
+    a body."""
 
-    def __init__(self, body: BodyFit | None, silhouettes: Silhouettes, settings: SkinSettings, rig: Rig, chosen: Sequence[int]) -> None:
+    def __init__(
+        self, body: BodyFit | None, silhouettes: Silhouettes, settings: SkinSettings, rig: Rig, chosen: Sequence[int], *, near: bool = True
+    ) -> None:
         self._body, self._silhouettes, self._settings = body, silhouettes, settings
         self._skins = {i: body_skin(shape_with_ends(body.shape, settings), body.motion.values[i], settings) for i in chosen} if body else {}
-        places = [skin.vertices_m for skin in self._skins.values()]
+        places = [skin.vertices_m for skin in self._skins.values()] if near else []
         self._views = alike([close_up(camera, places) for camera in rig.cameras])
 
     def of_frame(self, index: int, images: Sequence[np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:

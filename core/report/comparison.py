@@ -52,22 +52,23 @@ def comparison_page(take: str, measures: Sequence[Measure], folders: Sequence[Pa
     """The page of a take (its name), with pictures from the reports in the two result folders, in the order of `METHODS`."""
     wins = {method: [m.name for m in measures if m.winner == method] for method in METHODS}
     judged = sum(bool(m.better) for m in measures)
-    groups = list(dict.fromkeys(m.group for m in measures))
-    tables = "".join(f"<h3>{html.escape(group)}</h3>{_table([m for m in measures if m.group == group])}" for group in groups)
     body = (
         f"<h1>{html.escape(take)}: published and default method</h1>"
         f'<p class="verdict">Of {judged} measures, the default is better in {len(wins[DEFAULT])} and the published method in '
         f"{len(wins[PUBLISHED])}{_named(wins[PUBLISHED])}; in the others they differ by less than 2 %, or one has no value.</p>"
         '<p class="soft">Published: as D\'Apuzzo et al. 1999 and 2000 describe it, from clicked points. Default: Tricap as it is.</p>'
-        f"{tables}<h2>Pictures</h2>{''.join(_picture_rows(folders))}"
+        f"{_table(measures)}<h2>Pictures</h2>{''.join(_picture_rows(folders))}"
     )
     return document(f"Tricap: {take}, published and default", body, SCRIPT)
 
 
 def _table(measures: Sequence[Measure]) -> str:
-    """Measures as a table; the better value is bold."""
-    rows = []
-    for m in measures:
+    """The measures that either method has, by group; the better value is bold."""
+    rows, group = list[list[str]](), ""
+    for m in (m for m in measures if np.isfinite([m.published, m.default]).any()):
+        if m.group != group:
+            group = m.group
+            rows.append([f'<span class="soft">{html.escape(group)}</span>', *[""] * 4])
         cells = [_cell(m, method) for method in METHODS]
         rows.append([html.escape(m.name), *cells, html.escape(m.unit), f"{m.better} is better" if m.better else ""])
     return table(["", *METHODS, "unit", ""], rows)
@@ -79,7 +80,7 @@ def _named(names: Sequence[str]) -> str:
 
 def _cell(measure: Measure, method: str) -> str:
     value = measure.published if method == PUBLISHED else measure.default
-    text = written(value)
+    text = html.escape(written(value))
     return f'<b class="good">{text}</b>' if measure.winner == method else text
 
 

@@ -12,6 +12,7 @@ from ..geometry.raster import rasterize, vertex_normals
 from . import pictures
 from .person import Mesh
 
+NOT_WANTED = 'model = "none" under [body]'  # why there is no body, if the take says so
 PREDICTED = {
     BRIDGED: "the whole pose is predicted",
     SUSPECT: "residuals are large or observations few",
@@ -37,8 +38,8 @@ OPACITY = 0.6
 def headline(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> str:
     """Whether the result can be used, in a sentence. `doubtful`: the number of doubtful frames."""
     if body is None:
-        fit = record["stages"].get("fit", {})
-        return f"No body was fitted: {fit.get('not_done', 'it was not asked for')}."
+        why = record["stages"].get("fit", {}).get("not_done", NOT_WANTED)
+        return "Surface and trajectories, as the take asks for no body." if why == NOT_WANTED else f"No body was fitted: {why}."
     contradicted = sorted({frame for frames in body.contradicted.values() for frame in frames})
     if contradicted:
         return f"The images contradict the body in {_frames(len(contradicted))}: look at these before you use them."
@@ -99,7 +100,7 @@ def _of_surface(stages: Mapping[str, Any]) -> str:
     measured, tracked = stages.get("measure", {}), stages.get("track", {})
     if "points_per_frame" not in measured:
         return f"No surface was measured: {measured.get('not_done', 'it was not asked for')}."
-    text = f"The surface was measured in {measured['frames']} frames, with {measured['points_per_frame']:,.0f} points a frame (sigma "
+    text = f"The surface was measured in {_frames(measured['frames'])}, with {measured['points_per_frame']:,.0f} points a frame (sigma "
     points = f"{text}{measured['sigma_mm']:.2f} mm, median)"
     return f"{points} and {tracked['trajectories']:,} trajectories." if "trajectories" in tracked else f"{points}."
 

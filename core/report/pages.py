@@ -81,6 +81,7 @@ class Report:
     body: BodyFit | None
     silhouettes: Silhouettes
     doubtful: Mapping[int, str] = field(default_factory=dict)  # frame -> why, the worst first
+    close_ups: bool = True  # pictures show the person as large as they can; otherwise whole images, for pages beside each other
 
 
 def write_report(results: Results, report: Report, monitor: Monitor, pictured: Sequence[int] = ()) -> None:
@@ -125,10 +126,9 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
     spacing = report.record["settings"]["growing"]["spacing_px"]
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
-    near = close_up(camera, [clouds[i].xyz_m for i in chosen])
-    bodies = BodyPictures(
-        report.body if skinned else None, report.silhouettes, SkinSettings(**report.record["settings"]["skin"]), footage.rig, chosen
-    )
+    near = close_up(camera, [clouds[i].xyz_m for i in chosen] if report.close_ups else [])
+    settings = SkinSettings(**report.record["settings"]["skin"])
+    bodies = BodyPictures(report.body if skinned else None, report.silhouettes, settings, footage.rig, chosen, near=report.close_ups)
     for n, i in enumerate(chosen):
         monitor.step("report", n, 2 * len(chosen))
         cloud = clouds[i]
@@ -338,8 +338,8 @@ def _all_figures(record: Mapping[str, Any], rows: Sequence[Row]) -> str:
 
 
 def _picture_row(kind: str, figures: Sequence[str]) -> str:
-    """Figures beside each other; those that have two or four panels are wider."""
-    width = "single" if len(figures) == 1 else "broad" if kind in BROAD else ""
+    """Figures beside each other; those that have several panels are wider."""
+    width = "single" if kind == "layers" else "broad" if kind in BROAD else ""
     return f'<div class="row {width}">{"".join(figures)}</div>'
 
 

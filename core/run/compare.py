@@ -46,6 +46,7 @@ def run_both(
         with open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart) as run:
             if not pipeline.is_complete(run):
                 monitor.begin(method)
+                run.close_ups = False  # the same part of the images in both reports
                 pipeline.all_stages(run, monitor)
     return [out / method for method in METHODS]
 

@@ -29,7 +29,7 @@ from tricap.core.report.figures import figures_csv
 from tricap.core.report.film_strip import MOST_FRAMES, Shot, chosen_frames
 from tricap.core.report.graphs import SCRIPT, curve_graph
 from tricap.core.report.limb_strip import limb_strip
-from tricap.core.report.overview import WHY, body_by_sigma, bone_sigma_mm, headline, joint_words, sigma_colours, verdict
+from tricap.core.report.overview import NOT_WANTED, WHY, body_by_sigma, bone_sigma_mm, headline, joint_words, sigma_colours, verdict
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
@@ -88,6 +88,7 @@ def test_the_verdict_reports_doubt_before_anything_sounds_certain(monkeypatch: p
     record = {"stages": {"measure": {"frames": 3, "points_per_frame": 1234.0, "sigma_mm": 0.4}, "fit": {"not_done": "no clicked joints"}}}
     assert "1,234 points a frame" in verdict(record, None) and headline(record, None, 0) == "No body was fitted: no clicked joints."
     assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None)
+    assert "no body" in headline({"stages": {"fit": {"not_done": NOT_WANTED}}}, None, 0)
     good = verdict(record, fitted())
     assert "fitted in 3 frames. Its joints are known to" in good and good.endswith("Least certain is the right wrist, with 60 mm.")
     assert headline(record, fitted(), 0) == "No frame stands out as doubtful."
