@@ -51,7 +51,9 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
             monitor.step("film", t, len(joints.frames))
             mesh = read_ply(results.path("skin", f"{frame:04d}.ply"))
             places = {name: (xyz[t], _sigma(joints, name)[t]) for name, xyz in joints.joints_m.items()}
-            panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(footage.read(frame), cameras)]
+            panels = [
+                _panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(footage.read_whole(frame), cameras)
+            ]
             movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s   views {', '.join(c.name for c in cameras)}"))
         movie.release()
         if cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT) != len(joints.frames):  # the writer does not report a full disk

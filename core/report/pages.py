@@ -132,7 +132,7 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
     for n, i in enumerate(chosen):
         monitor.step("report", n, 2 * len(chosen))
         cloud = clouds[i]
-        images, sigma, frame, part = _whole(footage, cloud.frame), 1e3 * cloud.sigma_m, cloud.frame, near.around(cloud.xyz_m)
+        images, sigma, frame, part = footage.read_whole(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame, near.around(cloud.xyz_m)
         high, grey = float(np.percentile(sigma, 95)) if len(sigma) else 1.0, part.image(images[ref])
         at, radius = part.pixels(cloud.xy_px[:, ref]), max(1, round(DOT * spacing * part.scale))
         over = pictures.points_over_footage(grey, at, sigma, high, "sigma, mm", radius)
@@ -146,12 +146,6 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
             found[f"tracks_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
         found |= bodies.of_frame(i, images)
     return found
-
-
-def _whole(footage: Footage, frame: int) -> list[np.ndarray]:
-    """The images of a frame for the eye: of interlaced video the rows of the other field are interpolated."""
-    rows = footage.take.rows_at(frame)
-    return [rows.whole(image) for image in footage.read(frame)]
 
 
 def _first_middle_last(report: Report) -> list[int]:
@@ -186,7 +180,7 @@ def _shots(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None, monitor
     for n, i in enumerate(chosen):
         monitor.step("report", len(chosen) + n, 2 * len(chosen))
         part = near.around(about[i])
-        grey = part.image(_whole(footage, frames[i])[k])
+        grey = part.image(footage.read_whole(frames[i])[k])
         picture = pictures.jpeg(body_by_sigma(grey, part.camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i)))
         reason = report.doubtful.get(frames[i], "")
         why = f": {WHY.get(reason, reason)}" if reason else ""
