@@ -31,6 +31,7 @@ table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;bo
 .verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;
 overflow-wrap:anywhere;background:var(--box);padding:.6em}svg{color:var(--ink);background:none}
 @media print{:root{--paper:#fff;--ink:#000;--soft:#444;--line:#bbb;--note:#eee;--box:#f5f5f5}body{max-width:none;font-size:11pt}
+.row:not(.single,.broad,.cells){grid-template-columns:repeat(3,1fr)}.row.graphs{grid-template-columns:1fr 1fr}h2,summary{break-after:avoid}
 figure,svg,tr{break-inside:avoid}.stage,nav{display:none}.now{visibility:hidden}}
 """
 

@@ -16,6 +16,7 @@ from .overview import COLOURS, SIGMAS_MM
 MOST_FRAMES = 48  # in the film, besides the doubtful ones
 MOST_KEYS = 6  # in the strip, besides the doubtful ones
 MOST_DOUBTFUL = 3
+PAUSE_MS = (40.0, 200.0)  # between pictures, if the recording's own time is not between these
 CELL_PX = 420  # longer side of a picture
 
 SCRIPT = """
@@ -76,7 +77,7 @@ def chosen_frames(count: int, doubtful: Sequence[int]) -> tuple[list[int], set[i
 def film(shots: Sequence[Shot], fps: float, start: int, aside: str) -> str:
     """The film, which begins at the frame `start` and is hidden without a script, with HTML beside it, and the strip below both."""
     frames = [shot.frame for shot in shots]
-    pause = max(40.0, 1e3 * (frames[-1] - frames[0]) / max(1, len(frames) - 1) / fps)
+    pause = np.clip(1e3 * (frames[-1] - frames[0]) / max(1, len(frames) - 1) / fps, *PAUSE_MS)
     figures = "".join(_figure(shot) for shot in shots)
     stage = (
         '<div class="stage" hidden><img alt=""><div><button type="button">Play</button>'

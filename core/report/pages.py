@@ -173,13 +173,13 @@ def _shots(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None, monitor
         return []
     k = footage.take.reference
     camera, frames = footage.rig.cameras[k], body.motion.frames.tolist()
-    about = [about_joints(camera, joints) for joints in body.motion.joints_m]
-    near = close_up(camera, about, CELL_PX)
     chosen, keys = chosen_frames(len(frames), [frames.index(frame) for frame in report.doubtful if frame in frames])
+    about = [about_joints(camera, body.motion.joints_m[i]) for i in chosen]
+    near = close_up(camera, about, CELL_PX)
     found = []
     for n, i in enumerate(chosen):
         monitor.step("report", len(chosen) + n, 2 * len(chosen))
-        part = near.around(about[i])
+        part = near.around(about[n])
         grey = part.image(footage.read_whole(frames[i])[k])
         picture = pictures.jpeg(body_by_sigma(grey, part.camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i)))
         reason = report.doubtful.get(frames[i], "")

@@ -269,7 +269,7 @@ def test_names_are_text(tmp_path: Path) -> None:
 
 
 @needs_browser
-@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 2, "light"), (500, 1, "dark"), (794, 1, "paper")])
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 2, "light"), (500, 1, "dark"), (794, 2, "paper")])
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
