@@ -2,7 +2,7 @@
 decide how accurate a surface can be.
 
     s = z / f                                size of a pixel at the person, z its distance                                      (1)
-    γ = ∠(C_i − X, C_k − X)                  angle between the rays of the outer cameras at the person                          (2)
+    γ = ∠(C_i − X, C_k − X)                  largest angle between the rays of two cameras at the person                         (2)
 """
 
 import html
@@ -19,6 +19,7 @@ from .drawing import length_words
 WIDTH, HEIGHT, MARGIN = 520, 340, 34
 MOST_POINTS = 600  # of the person
 MOST_FRAMES = 100  # of its path
+FIELD = 1.2  # how far a field of view is drawn, by the distance of the farthest point
 TEXT = 'font-family="sans-serif" font-size="12" fill="currentColor"'
 PERSON, PATH, VIEW = "#2e86c1", "#d1495b", "#c98a1b"
 
@@ -59,8 +60,8 @@ def words(shown: Arrangement) -> str:
     angle = float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
     return (
         f"The recording from above. The person is {depth:.2f} m in front of camera {shown.reference.name}; blue are the measured points of "
-        f"one frame, and the red line is where their middle goes. The outer cameras are {apart.max():.2f} m apart, and their rays meet at "
-        f"{angle:.0f}° at the person. "
+        f"one frame, and the red line is where their middle goes. The cameras are up to {apart.max():.2f} m apart, and their rays meet at "
+        f"up to {angle:.0f}° at the person. "
         f"A pixel is {1e3 * depth / shown.reference.focal_px:.1f} mm wide at the person."
     )
 
@@ -72,8 +73,9 @@ def plan(shown: Arrangement) -> str:
         return shown.reference.to_camera(xyz_m)[..., [0, 2]]
 
     centres = above(np.array([c.centre_m for c in shown.cameras]))
-    far = 1.25 * max(float(np.linalg.norm(above(shown.person_m) - centres.mean(axis=0), axis=1).max()), 0.1)
-    fields = [above(_edges(camera, far)) for camera in shown.cameras]
+    fields = [
+        above(_edges(camera, FIELD * float(np.linalg.norm(shown.person_m - camera.centre_m, axis=1).max()))) for camera in shown.cameras
+    ]
     everything = np.concatenate([centres, above(shown.person_m), above(shown.path_m)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     px_per_m = float(min((WIDTH - 2 * MARGIN) / max(high[0] - low[0], 0.1), (HEIGHT - 2 * MARGIN) / max(high[1] - low[1], 0.1)))

@@ -17,7 +17,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median, mad_sigma
 from ..motion.formats.ply import read_ply
-from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page
+from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page, written
 from ..results.folder import Results, check_inside, check_separate_folder
 from . import pipeline
 from .settings import Overrides
@@ -133,4 +133,4 @@ def as_lines(measures: Sequence[Measure]) -> list[str]:
     """The measures as a table of text."""
     width = max(len(m.name) for m in measures)
     rows = [f"{'':<{width}}  {PUBLISHED:>10}  {DEFAULT:>10}"]
-    return rows + [f"{m.name:<{width}}  {m.published:>10.4g}  {m.default:>10.4g}  {m.unit}" for m in measures]
+    return rows + [f"{m.name:<{width}}  {written(m.published):>10}  {written(m.default):>10}  {m.unit}" for m in measures]
