@@ -29,8 +29,8 @@ for (const film of document.querySelectorAll('.film')) {
     now.src = shots[i].querySelector('img').src
     words.textContent = now.alt = shots[i].querySelector('figcaption').textContent
     for (const svg of document.querySelectorAll('.strip svg')) {
-      const place = svg.querySelector('.now'), [first, , count] = svg.getAttribute('viewBox').split(' ').map(Number)
-      if (place) place.setAttribute('x', first + Math.min(count - place.width.baseVal.value, shots[i].dataset.frame - film.dataset.first))
+      const place = svg.querySelector('.now')
+      if (place) place.setAttribute('x', shots[i].dataset.frame - film.dataset.first + 0.5 - place.width.baseVal.value / 2)
     }
   }
   const nearest = frame => {

@@ -19,7 +19,7 @@ def limb_strip(frames: Sequence[int], words: Mapping[str, Sequence[str]]) -> str
     if not words or not len(frames):
         return ""
     first, count = frames[0], frames[-1] + 1 - frames[0]
-    rows, now = [], f'<rect class="now" x="-9" width="{max(0.5, count / 250):.2f}" height="{BAR}" fill="currentColor"/>'
+    rows, now = [], f'<rect class="now" x="-9" width="{count / 90:.3f}" height="{BAR}" fill="currentColor"/>'
     for limb, row in words.items():
         bars = "".join(_bar(limb, a, b, word, first) for a, b, word in runs(frames, row))
         rows.append(
