@@ -15,7 +15,7 @@ figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{dis
 grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.cells{gap:.4em;
 grid-template-columns:repeat(auto-fill,minmax(min(30%,120px),1fr))}.graphs{
 grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}.wide{overflow-x:auto}
-.single{grid-template-columns:1fr}.broad{grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}
+.single{grid-template-columns:1fr}.broad{grid-template-columns:repeat(auto-fill,minmax(min(100%,440px),1fr))}
 figure img{width:100%}.strip{display:grid;grid-template-columns:max-content 1fr;gap:4px .8em;font-size:13px;line-height:18px}
 .strip>span{text-align:right}.strip svg{width:100%;height:18px}.strip div{display:flex;justify-content:space-between}
 .strip div:last-child{justify-content:flex-start;align-items:flex-end;gap:.4em}

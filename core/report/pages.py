@@ -277,7 +277,8 @@ def _facts(record: Mapping[str, Any]) -> str:
     (first, end), fps, lines = record["frames"], record["fps"], record["interlaced"]
     how = "" if lines == "none" else f" · interlaced video, {'both fields' if lines == 'both' else f'its {lines} lines'}"
     views = f"{len(record['views'])} views ({', '.join(record['views'])})"
-    return f"{views} · frames {first} to {end - 1}, {(end - first) / fps:.2f} s at {fps:g} frames/s{how}"
+    span = f"frames {first} to {end - 1}, {(end - first) / fps:.2f} s at {fps:g} frames/s" if end - first > 1 else f"frame {first}"
+    return f"{views} · {span}{how}"
 
 
 def _first_screen(report: Report, shots: Sequence[Shot]) -> str:
@@ -333,7 +334,7 @@ def _all_figures(record: Mapping[str, Any], rows: Sequence[Row]) -> str:
 
 def _picture_row(kind: str, figures: Sequence[str]) -> str:
     """Figures beside each other; those that have several panels are wider."""
-    width = "single" if kind == "layers" else "broad" if kind in BROAD else ""
+    width = "single" if kind == "layers" else "broad" if kind in BROAD or len(figures) < 3 else ""
     return f'<div class="row {width}">{"".join(figures)}</div>'
 
 
