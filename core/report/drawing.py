@@ -8,6 +8,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN_PX, ARM_PX = 12, 26
 NARROW_PX = 400
 OF_PANELS = 1.7  # size of letters in pictures of two panels, which are shown smaller
+PLATE = 0.4  # brightness behind a bar of colours
 LONGEST = 0.3  # of the picture's width, that a scale takes at most
 RAMP = cv2.applyColorMap(np.linspace(25, 245, 256).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0]  # blue to red, BGR
 
@@ -72,6 +73,8 @@ def add_colour_bar(picture: np.ndarray, high: float, words: str, size: float = 0
     """The colours from 0 to `high` in the upper left corner, with what they mean (ASCII), such as "speed, m/s"."""
     k, width = size or size_of(picture), picture.shape[1]
     left, top, length, thick = round(MARGIN_PX * k), round(22 * k), round(LONGEST * width), max(4, round(6 * k))
+    plate = picture[: top + thick + round(18 * k), : 2 * left + length]
+    plate[:] = (PLATE * plate).astype(np.uint8)  # readable over whatever is there
     cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + thick), SHADOW, -1)
     picture[top : top + thick, left : left + length] = RAMP[np.linspace(0, 255, length).astype(int)]
     small_text(picture, words, (left, top - round(7 * k)), size=k)
