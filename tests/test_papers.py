@@ -59,9 +59,8 @@ def faults(here: str, test: str) -> list[str]:
             group, _, name = span.partition(".")
             found += [span] if group not in SETTINGS or name not in SETTINGS[group].__dataclass_fields__ else []
     found += [word for word in re.findall(r"\*([^*]+)\*", here) if word not in words_of_the_panel()]
-    file, _, function = SPAN.findall(test)[0].partition("::")
-    path = ROOT / "tests" / file
-    return found + ([test] if not path.is_file() or function not in functions_of(path) else [])
+    tests = [(ROOT / "tests" / file, function) for file, _, function in (span.partition("::") for span in SPAN.findall(test))]
+    return found + [test for path, function in tests or [(ROOT, "")] if not path.is_file() or function not in functions_of(path)]
 
 
 def test_every_sentence_of_the_papers_has_a_row() -> None:
@@ -80,4 +79,8 @@ def test_what_does_not_exist_is_found() -> None:
     assert not faults(here, test)
     for wrong in ("`tricap dance`", "`tricap run --dance`", "`skin.dance`", "`dance.relief`", "*Dance*"):
         assert faults(wrong, test)
-    assert faults(here, "`test_papers.py::test_dance`") and faults(here, "`test_dance.py::test_dance`")
+    assert (
+        faults(here, "`test_papers.py::test_dance`")
+        and faults(here, "`test_dance.py::test_dance`")
+        and faults(here, f"{test}, `test_papers.py::test_dance`")
+    )

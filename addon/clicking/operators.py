@@ -30,6 +30,7 @@ class ClickOperator:
     session: ClickSession
     timer: Any = None
     visible = False  # whether a view is shown
+    keys = KEYS  # in the status bar
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """The names to click, in order."""
@@ -161,7 +162,7 @@ class ClickOperator:
     def _show(self, context: bpy.types.Context) -> None:
         needed = getattr(self, "needed", "")  # of ClickJoints alone
         optional = " (optional: the buttons above the first view go on)" if needed not in ("", self.session.name) else ""
-        show_status(context, f"{self.session.name}{optional}    {KEYS}")
+        show_status(context, f"{self.session.name}{optional}    {self.keys}")
         canvas.redraw_clips(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
@@ -169,11 +170,15 @@ class ClickOperator:
         session = self.session
         if not session.changed or not session.has_all_clips:
             return {"FINISHED" if session.changed else "CANCELLED"}
-        done = len(session.names) - len(session.missing(skipped=True))
-        result = f"Frame {session.frame}: {done} of {len(session.names)} clicked in two or more views."
-        missing = "" if getattr(self, "needed", "") else _what_is_missing(session)
-        self.report({"INFO"}, f"{result}{missing} Go on with the buttons above the first view.")  # type: ignore[attr-defined]
+        self.report({"INFO"}, self.result(len(session.names) - len(session.missing(skipped=True))))  # type: ignore[attr-defined]
         return {"FINISHED"}
+
+    def result(self, done: int) -> str:
+        """What is reported in the end; `done`: the number of names that are clicked in as many views as are needed."""
+        session = self.session
+        missing = "" if getattr(self, "needed", "") else _what_is_missing(session)
+        clicked = f"Frame {session.frame}: {done} of {len(session.names)} clicked in two or more views."
+        return f"{clicked}{missing} Go on with the buttons above the first view."
 
 
 def _what_is_missing(session: ClickSession) -> str:

@@ -138,7 +138,7 @@ def put_into_scene(
     if body is not None:
         chosen.source, chosen.export = chosen.source or body, chosen.export or body
     if first and body is not None:
-        _frame(operator, context, body)
+        frame_in_views(operator, context, body)
 
 
 def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: "Contents") -> None:
@@ -158,7 +158,7 @@ def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, conten
     through = [view for view in views if first or view.view_perspective == "CAMERA"]
     write_scene(replace(contents, warnings=(), shape=None, motion=None), options=replace(DEFAULTS, studio=False))
     if first and views:
-        _hide_default_objects(operator, context)
+        hide_default_objects(operator, context)
     for view in through if context.scene.camera is not None else ():  # the cameras of an earlier build are gone, and their view with them
         view.view_perspective = "CAMERA"
 
@@ -169,22 +169,25 @@ def _views(context: bpy.types.Context) -> list[bpy.types.RegionView3D]:
     return [area.spaces.active.region_3d for area in areas if area.type == "VIEW_3D"]
 
 
-def _frame(operator: bpy.types.Operator, context: bpy.types.Context, body: bpy.types.Object) -> None:
-    """Frame the body in the 3-D views, without the objects of Blender's startup file, and its frames in the timelines."""
+def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, thing: bpy.types.Object, *, front: bool = False) -> None:
+    """Frame a body or a picture in the 3-D views, without the objects of Blender's startup file, and its frames in the timelines. With
+    `front`, it is seen from the front."""
     if context.window is None or bpy.app.background:
         return
-    _hide_default_objects(operator, context)
+    hide_default_objects(operator, context)
     for item in context.selected_objects:
         item.select_set(False)
-    body.select_set(True)
+    thing.select_set(True)
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
         region = next(r for r in area.regions if r.type == "WINDOW")
         with context.temp_override(area=area, region=region):
+            if front:
+                bpy.ops.view3d.view_axis(type="FRONT")
             bpy.ops.view3d.view_selected()
     show_all_frames(context)
 
 
-def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+def hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
     """Hide the cube of Blender's startup file, in which the body would stand up to the chest, its light and its camera, if unchanged."""
     wanted = {"Cube": _is_default_cube, "Light": _is_default_light, "Camera": _is_default_camera}
     hidden = [thing for name, unchanged in wanted.items() if (thing := context.scene.objects.get(name)) is not None and unchanged(thing)]
@@ -194,7 +197,7 @@ def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Conte
     if hidden:
         lower = [thing.name.lower() for thing in hidden]
         names, were = " and ".join(filter(None, [", ".join(lower[:-1]), lower[-1]])), "were" if len(hidden) > 1 else "was"
-        operator.report({"INFO"}, f"Blender's default {names} {were} hidden to show the body alone.")
+        operator.report({"INFO"}, f"Blender's default {names} {were} hidden to make room.")
 
 
 def _is_default_cube(cube: bpy.types.Object) -> bool:

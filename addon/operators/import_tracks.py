@@ -46,11 +46,13 @@ class ImportTracks2d(TellingOperator, bpy.types.Operator):
         from ...core.cli.track2d import open_footage
         from ...core.tracking.point_tables import read_planar
         from ..scene.planar import add_planar
+        from .build_scene import frame_in_views
 
         table = read_planar(folders.absolute(self.filepath))
         joined = read_joints(folders.absolute(self.points), table) if self.points else ()
         footage = open_footage(folders.absolute(self.footage)) if self.footage else None
         made = add_planar(context.scene, table, joined, footage)
+        frame_in_views(self, context, made.objects[0], front=True)
         return f"{made.name}: {len(table.names)} points over {len(table.frames)} frames, {len(joined)} curves"
 
 

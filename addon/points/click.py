@@ -14,6 +14,7 @@ from ..panels import TellingOperator
 from .join import clip_named
 
 MOST = 1000  # points with names of their own
+KEYS_2D = "Click: set the next point    Backspace: undo    Esc: finish"
 
 
 class ClickPoints(operators.ClickOperator, bpy.types.Operator):
@@ -33,6 +34,18 @@ class ClickPoints(operators.ClickOperator, bpy.types.Operator):
         clip = clip_named(context, "")
         clips = {clip.name: clip}
         return ClickSession(clips, self.names(context, clips), context.scene.frame_current, None), ""
+
+    @property
+    def keys(self) -> str:  # type: ignore[override]
+        """In 2-D there are neither proposals nor other views."""
+        return KEYS_2D if self.flat else operators.KEYS
+
+    def result(self, done: int) -> str:
+        """How many points are new, and what to press next."""
+        points = f"Frame {self.session.frame}: {done} new {'point' if done == 1 else 'points'}"
+        if self.flat:
+            return f"{points}. Press Follow in This View (2-D); Join Selected Points draws lines between them."
+        return f"{points}, clicked in two or more views. Press Follow Points."
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """Any number of points, in the current frame."""

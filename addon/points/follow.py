@@ -99,7 +99,7 @@ class FollowPoints2d(JobOperator, bpy.types.Operator):
         if not points:
             raise InputError(f"No points are clicked in frame {frame} of {clip.name}. Press Click Points (2-D), and click some.")
         name = re.sub(r"\W+", "_", clip.name, flags=re.ASCII).strip("_") or "clip"
-        out, path = folders.output_folder("", context.scene), folders.absolute(clip.filepath)
+        out, path = results_folder(context.scene), folders.absolute(clip.filepath)
         folders.check_writable(out)
         own, shift = clicks.clip_frame(clip, frame) + clip.frame_offset, clip.frame_start - 1 - clip.frame_offset
         pairs = [pair for pair in tracks.joined(clip) if points.keys() >= set(pair)]
@@ -110,9 +110,11 @@ class FollowPoints2d(JobOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, result: "Planar") -> set[str]:
         """Build the picture with its points and lines."""
         from ...core.tracking.point_tables import read_planar
+        from ..operators.build_scene import frame_in_views
         from ..scene.planar import add_planar
 
         made = add_planar(context.scene, read_planar(result.path), result.joined, result.sequence, first=result.shift)
+        frame_in_views(self, context, made.objects[0], front=True)
         told = f"{made.name}: {len(result.names)} points over {len(result.tracks.frames)} frames, {len(result.joined)} lines; {result.path}"
         self.report({"INFO"}, told)
         return {"FINISHED"}
@@ -128,6 +130,17 @@ class Planar:
     tracks: "PlanarTracks"
     sequence: "ImageSequence"
     shift: int
+
+
+def results_folder(scene: bpy.types.Scene) -> Path:
+    """Where the tables of single clips are written: with the results of the take, or without one in the folder next to the Blender file.
+
+    Raises:
+        InputError: there is no take, and the Blender file was never saved.
+    """
+    if scene.tricap.take or scene.tricap.out:
+        return folders.output_folder("", scene)
+    return project.folder_of(scene) / project.RESULTS
 
 
 def follow_planar(

@@ -4,9 +4,9 @@ import bpy
 
 
 def _classes() -> tuple[type, ...]:
-    from . import cameras, check, export, footage, network, panel, person, synchronise
+    from . import cameras, check, export, footage, network, panel, person, report, synchronise
 
-    modules = (footage, person, cameras, check, synchronise, network, export, panel)
+    modules = (footage, person, cameras, check, synchronise, network, export, report, panel)
     return tuple(cls for module in modules for cls in module.CLASSES)
 
 

@@ -183,6 +183,7 @@ def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) 
     _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")
+        layout.operator("tricap.open_report", icon="TEXT")
     draw_dofs(layout, context.scene)
 
 

@@ -17,6 +17,8 @@ from ..run.compare import as_lines, as_row, measures_of, run_both, write_compari
 from ..synthetic.score import Score, score_run
 from .arguments import frame_range, overrides
 
+TRUTH = "Against the truth"  # group of measures
+
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Compare; the table's lines. Raises as `run_both`."""
@@ -52,4 +54,6 @@ def _of_truth(published: Score, default: Score) -> list[Measure]:
         except AttributeError:  # a part of the score is None: the run lacks that result
             return float("nan")
 
-    return [Measure(name=n, unit=u, published=value(published, of), default=value(default, of), better=b) for n, u, b, of in wanted]
+    return [
+        Measure(group=TRUTH, name=n, unit=u, published=value(published, of), default=value(default, of), better=b) for n, u, b, of in wanted
+    ]

@@ -79,10 +79,10 @@ def _draw(folder: Path, footage: Footage, names: tuple[str, ...], tracked: KeyPo
     """Write a picture per frame and view, and paths.png, the paths in space."""
     for t, frame in enumerate(tracked.frames.tolist()):
         monitor.step("pictures", t, len(tracked.frames))
-        for k, (grey, camera) in enumerate(zip(footage.read(frame), footage.rig.cameras)):
+        for k, (grey, camera) in enumerate(zip(footage.read_whole(frame), footage.rig.cameras)):
             picture = paths_over_footage(grey, names, tracked.xy_px[:, :, k], t)
             store.write_bytes(folder / camera.name / f"{frame:04d}.png", png(picture))
-    in_space = paths_in_space(tracked, footage.rig.cameras[footage.take.reference])
+    in_space = paths_in_space(names, tracked, footage.rig.cameras[footage.take.reference])
     if in_space is not None:
         store.write_bytes(folder / "paths.png", png(in_space))
 

@@ -68,9 +68,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """All stages, from the images to the Blender file; the lines to show."""
     given, engine = (args.take, args.out, overrides(args.set), frame_range(args.frames)), _engine(args)
     with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
-        if not args.pictures and pipeline.is_complete(job) and _has_scene(job, args):
+        if not args.pictures and pipeline.is_complete(job):
             job.record["warnings"] = job.results.read_run().get("warnings", [])
-            lines = ["Nothing has changed since that run; --restart begins anew."]
+            unchanged = "Nothing has changed since that run; --restart begins anew."
+            lines = [unchanged] if _has_scene(job, args) else _build_scene(job, args, monitor)
         else:
             job.engine = engine
             pipeline.all_stages(job, monitor)

@@ -9,13 +9,23 @@ import numpy as np
 
 from ..images.sequence import decoded
 from . import pictures
-from .document import document, figure, table
+from .document import SCRIPT, document, figure, table
 
 PUBLISHED, DEFAULT = "published", "default"  # the methods, by the names of their presets
 METHODS = (PUBLISHED, DEFAULT)
 HIGHER, LOWER, NEITHER = "higher", "lower", ""  # which values of a measure are better
+LEAST = 0.001  # smaller values are not written out
 EQUAL = 0.02  # relative difference below which neither method is better
-KINDS = ("trails", "vectors", "surface", "cloud", "tracks", "body", "layers")  # of pictures
+KINDS = {  # of pictures, and their captions
+    "surface": "measured points, coloured by their sigma",
+    "cloud": "the cloud from the front and from the right side",
+    "tracks": "the paths of the points over the last frames, coloured by speed",
+    "trails": "trajectories from the front and from the right side",
+    "vectors": "vectors of the tracked points, from the front and from the right side",
+    "body": "the fitted body",
+    "layers": "the layers of the body in its rest pose",
+}
+WHICH = {"all": "before the filters", "kept": "kept by the filters", "removed": "removed by the filters, coloured by reason"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -27,6 +37,7 @@ class Measure:
     published: float
     default: float
     better: str = NEITHER
+    group: str = ""  # of measures, in the table
 
     @property
     def winner(self) -> str:
@@ -39,19 +50,28 @@ class Measure:
 
 def comparison_page(take: str, measures: Sequence[Measure], folders: Sequence[Path]) -> str:
     """The page of a take (its name), with pictures from the reports in the two result folders, in the order of `METHODS`."""
-    rows = []
-    for m in measures:
-        cells = [_cell(m, method) for method in METHODS]
-        rows.append([html.escape(m.name), *cells, html.escape(m.unit), f"{m.better} is better" if m.better else ""])
     wins = {method: [m.name for m in measures if m.winner == method] for method in METHODS}
     judged = sum(bool(m.better) for m in measures)
     body = (
         f"<h1>{html.escape(take)}: published and default method</h1>"
         f'<p class="verdict">Of {judged} measures, the default is better in {len(wins[DEFAULT])} and the published method in '
         f"{len(wins[PUBLISHED])}{_named(wins[PUBLISHED])}; in the others they differ by less than 2 %, or one has no value.</p>"
-        f"{table(['', *METHODS, 'unit', ''], rows)}<h2>Pictures</h2>{''.join(_picture_rows(folders))}"
+        '<p class="soft">Published: as D\'Apuzzo et al. 1999 and 2000 describe it, from clicked points. Default: Tricap as it is.</p>'
+        f"{_table(measures)}<h2>Pictures</h2>{''.join(_picture_rows(folders))}"
     )
-    return document(f"Tricap: {take}, published and default", body)
+    return document(f"Tricap: {take}, published and default", body, SCRIPT)
+
+
+def _table(measures: Sequence[Measure]) -> str:
+    """The measures that either method has, by group; the better value is bold."""
+    rows, group = list[list[str]](), ""
+    for m in (m for m in measures if np.isfinite([m.published, m.default]).any()):
+        if m.group != group:
+            group = m.group
+            rows.append([f'<span class="soft">{html.escape(group)}</span>', *[""] * 4])
+        cells = [_cell(m, method) for method in METHODS]
+        rows.append([html.escape(m.name), *cells, html.escape(m.unit), f"{m.better} is better" if m.better else ""])
+    return table(["", *METHODS, "unit", ""], rows)
 
 
 def _named(names: Sequence[str]) -> str:
@@ -60,8 +80,17 @@ def _named(names: Sequence[str]) -> str:
 
 def _cell(measure: Measure, method: str) -> str:
     value = measure.published if method == PUBLISHED else measure.default
-    text = f"{value:.4g}" if np.isfinite(value) else "–"
+    text = html.escape(written(value))
     return f'<b class="good">{text}</b>' if measure.winner == method else text
+
+
+def written(value: float) -> str:
+    """A value with three digits; a dash for none, and for very small ones what they are below."""
+    if not np.isfinite(value):
+        return "–"
+    if 0 < abs(value) < LEAST:
+        return f"< {LEAST:g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".") if value else "0"
 
 
 def _picture_rows(folders: Sequence[Path]) -> list[str]:
@@ -69,9 +98,16 @@ def _picture_rows(folders: Sequence[Path]) -> list[str]:
     found = [{path.name: path for path in sorted((folder / "report").glob("*.png"))} for folder in folders]
     rows = []
     for kind in KINDS:
-        for name in (name for name in found[0] if name.startswith(f"{kind}_") and name in found[1]):
-            which = name.removesuffix(".png").removeprefix(f"{kind}_").replace("_", ", view ")
-            label = f"trajectories, {which}" if kind == "trails" else f"{kind}, frame {which}"
-            pair = [figure(f"{label}: {method}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)]
-            rows.append(f'<div class="row">{"".join(pair)}</div>')
+        for name in (name for name in found[0] if name.startswith((f"{kind}_", f"{kind}.")) and name in found[1]):
+            caption = _caption(kind, name.removesuffix(".png").removeprefix(kind).removeprefix("_"))
+            pair = [figure(f"{method}: {caption}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)]
+            rows.append(f'<div class="row broad">{"".join(pair)}</div>')
     return rows
+
+
+def _caption(kind: str, rest: str) -> str:
+    """A caption from the rest of a picture's file name: the frame and view, or which trajectories."""
+    frame, _, view = rest.partition("_")
+    if frame.isdecimal():
+        return f"{KINDS[kind]}, frame {int(frame)}{f', view {view}' if view else ''}"
+    return f"{KINDS[kind]}: {WHICH.get(rest, rest)}" if rest else KINDS[kind]

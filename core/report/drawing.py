@@ -7,33 +7,38 @@ WHITE, SHADOW = (255, 255, 255), (20, 20, 20)  # BGR
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN_PX, ARM_PX = 12, 26
 NARROW_PX = 400
+OF_PANELS = 1.7  # size of letters in pictures of two panels, which are shown smaller
+PLATE = 0.4  # brightness behind a bar of colours
 LONGEST = 0.3  # of the picture's width, that a scale takes at most
+RAMP = cv2.applyColorMap(np.linspace(25, 245, 256).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0]  # blue to red, BGR
 
 
 def size_of(picture: np.ndarray) -> float:
-    """How much larger letters, lines and margins are than in a picture of `NARROW_PX`: a page shows all pictures about as wide."""
-    return max(1.0, picture.shape[1] / NARROW_PX)
+    """How much larger letters, lines and margins are than in a picture of `NARROW_PX`: a page shows all pictures about as large."""
+    return max(1.0, max(picture.shape[:2]) / NARROW_PX)
 
 
-def small_text(picture: np.ndarray, words: str, at: tuple[int, int], colour: tuple[int, int, int] = WHITE) -> None:
-    """Words with a dark outline, from a pixel on their base line."""
-    k = size_of(picture)
-    cv2.putText(picture, words, at, FONT, 0.42 * k, SHADOW, round(3 * k), cv2.LINE_AA)
-    cv2.putText(picture, words, at, FONT, 0.42 * k, colour, max(1, round(k)), cv2.LINE_AA)
+def small_text(picture: np.ndarray, words: str, at: tuple[int, int], colour: tuple[int, int, int] = WHITE, size: float = 0) -> None:
+    """Words with a dark outline, from a pixel on their base line; `size` of the letters, by default that of the picture."""
+    k = size or size_of(picture)
+    thick, step = max(1, round(k)), max(1, round(k))
+    for dx, dy in ((-step, 0), (step, 0), (0, -step), (0, step)):  # a thicker line would be wider: letters would not lie on their outline
+        cv2.putText(picture, words, (at[0] + dx, at[1] + dy), FONT, 0.42 * k, SHADOW, thick, cv2.LINE_AA)
+    cv2.putText(picture, words, at, FONT, 0.42 * k, colour, thick, cv2.LINE_AA)
 
 
-def add_scale(picture: np.ndarray, px_per_m: float, note: str = "") -> None:
+def add_scale(picture: np.ndarray, px_per_m: float, note: str = "", size: float = 0) -> None:
     """A bar of a round length in the lower left corner, with the length and a note; none where a metre has no size."""
     if not np.isfinite(px_per_m) or px_per_m <= 0:
         return
-    (height, width), k = picture.shape[:2], size_of(picture)
+    (height, width), k = picture.shape[:2], size or size_of(picture)
     most_m = LONGEST * width / px_per_m
     power = 10.0 ** np.floor(np.log10(most_m))
     bar_m = next(m * power for m in (5.0, 2.0, 1.0) if m * power <= most_m * (1 + 1e-9))
     left, y = round(MARGIN_PX * k), height - round(14 * k)
     for colour, thick in ((SHADOW, 4), (WHITE, 2)):
         cv2.line(picture, (left, y), (left + round(bar_m * px_per_m), y), colour, round(thick * k))
-    small_text(picture, length_words(bar_m) + (f" {note}" if note else ""), (left, y - round(7 * k)))
+    small_text(picture, length_words(bar_m) + (f" {note}" if note else ""), (left, y - round(7 * k)), size=k)
 
 
 def length_words(metres: float) -> str:
@@ -43,17 +48,38 @@ def length_words(metres: float) -> str:
     return f"{100 * metres:g} cm" if metres >= 0.01 else f"{1000 * metres:g} mm"
 
 
-def add_axes(picture: np.ndarray, names: tuple[str, str], *, left: bool = False, up: bool = False) -> None:
+def add_axes(picture: np.ndarray, names: tuple[str, str], *, left: bool = False, up: bool = False, size: float = 0) -> None:
     """Arrows with names in the lower right corner: the first to the right (to the left with `left`), the second down (or `up`)."""
-    k = size_of(picture)
+    k = size or size_of(picture)
     corner = np.array([picture.shape[1] - 48 * k, picture.shape[0] - (18 if up else 44) * k])
     first, second = (-ARM_PX if left else ARM_PX, 0), (0, -ARM_PX if up else ARM_PX)
     for name, arm, shift in ((names[0], first, (-11, 4) if left else (3, 4)), (names[1], second, (4, 0) if up else (4, 8))):
         tip = corner + k * np.array(arm)
         for colour, thick in ((SHADOW, 3), (WHITE, 1)):
             cv2.arrowedLine(picture, _pixel(corner), _pixel(tip), colour, round(thick * k), cv2.LINE_AA, tipLength=0.25)
-        small_text(picture, name, _pixel(tip + k * np.array(shift)))
+        small_text(picture, name, _pixel(tip + k * np.array(shift)), size=k)
 
 
 def _pixel(xy: np.ndarray) -> tuple[int, int]:
     return round(float(xy[0])), round(float(xy[1]))
+
+
+def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Colours (…, 3) BGR uint8 of values (…) from blue (low) over green and yellow to red (high)."""
+    return np.asarray(RAMP[np.clip(255 * (values - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)])
+
+
+def add_colour_bar(picture: np.ndarray, high: float, words: str, size: float = 0) -> None:
+    """The colours from 0 to `high` in the upper left corner, with what they mean (ASCII), such as "speed, m/s"."""
+    k, width = size or size_of(picture), picture.shape[1]
+    left, top, length, thick = round(MARGIN_PX * k), round(22 * k), round(LONGEST * width), max(4, round(6 * k))
+    plate = picture[: top + thick + round(18 * k), : 2 * left + length]
+    plate[:] = (PLATE * plate).astype(np.uint8)  # readable over whatever is there
+    cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + thick), SHADOW, -1)
+    picture[top : top + thick, left : left + length] = RAMP[np.linspace(0, 255, length).astype(int)]
+    small_text(picture, words, (left, top - round(7 * k)), size=k)
+    base = top + thick + round(13 * k)
+    small_text(picture, "0", (left, base), size=k)
+    end = f"{high:.2g}"
+    wide = cv2.getTextSize(end, FONT, 0.42 * k, 1)[0][0]
+    small_text(picture, end, (left + length - wide, base), size=k)

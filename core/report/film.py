@@ -1,10 +1,12 @@
-"""film.mp4: the fitted body over every frame of every view, side by side.
+"""film.mp4: the fitted body over every frame of every view, side by side, in the part of each view through which the person moves.
 
 It is made from the files of a run (skin/, joints.csv, body.toml), so that it can be made later, too. A joint is coloured by its reported
 sigma, as in the report.
 """
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,10 +21,13 @@ from ..motion.formats.ply import read_ply
 from ..motion.tables import JointTable, read_joints
 from ..results.folder import Results
 from ..take.footage import Footage
-from .overview import sigma_colours
+from .close_up import Detail, alike, close_up
+from .overview import about_joints, sigma_colours
 from .pictures import OPACITY, SKIN_COLOUR, colour
 
-WIDTH_PX = 1920  # of the movie, at most
+WIDTH_PX, HEIGHT_PX = 1920, 1080  # of the movie, at most
+LARGEST = 2.0  # a pixel of the footage, in pixels of the movie
+MOST_PLACES = 300  # of each joint, that show where the person is
 CODEC = "mp4v"
 BAR_PX = 26  # height of the line of text
 
@@ -38,7 +43,8 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
         raise InputError(f"{results.folder} has no fitted body with a skin, and a film needs one; run the fit first.")
     joints, skeleton = read_joints(results.path("joints.csv")), read_body(results.path("body.toml")).skeleton
     bones = [(bone.head_joint, bone.tail_joint) for bone in skeleton.bones]
-    cameras = _smaller(footage.rig.cameras)
+    details = _details(footage.rig.cameras, joints)
+    cameras = [detail.camera for detail in details]
     size = sum(c.size_px[0] for c in cameras), max(c.size_px[1] for c in cameras) + BAR_PX
     part = results.path("cache", "film.mp4")
     part.parent.mkdir(parents=True, exist_ok=True)
@@ -51,7 +57,8 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
             monitor.step("film", t, len(joints.frames))
             mesh = read_ply(results.path("skin", f"{frame:04d}.ply"))
             places = {name: (xyz[t], _sigma(joints, name)[t]) for name, xyz in joints.joints_m.items()}
-            panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(footage.read(frame), cameras)]
+            images = [detail.image(grey) for detail, grey in zip(details, footage.read_whole(frame))]
+            panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(images, cameras)]
             movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s   views {', '.join(c.name for c in cameras)}"))
         movie.release()
         if cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT) != len(joints.frames):  # the writer does not report a full disk
@@ -64,10 +71,16 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
     return results.path("film.mp4")
 
 
-def _smaller(cameras: tuple[Camera, ...]) -> list[Camera]:
-    """The cameras of images that fit side by side into the movie."""
-    factor = min(1.0, WIDTH_PX / sum(c.size_px[0] for c in cameras))
-    return [c.resized((round(c.size_px[0] * factor), round(c.size_px[1] * factor))) for c in cameras]
+def _details(cameras: Sequence[Camera], joints: JointTable) -> list[Detail]:
+    """The part of each view in which the person is in any of the frames; as large as the movie has room for."""
+    every = max(1, len(joints.frames) // MOST_PLACES)
+    places = np.concatenate([xyz[::every] for xyz in joints.joints_m.values()])
+    places = places[np.isfinite(places).all(axis=1)]
+    near = [about_joints(camera, places) for camera in cameras]
+    views = alike([close_up(camera, [points]) for camera, points in zip(cameras, near)])
+    width, height = sum(view.part_px[0] for view in views), max(view.part_px[1] for view in views)
+    factor = min(WIDTH_PX / width, HEIGHT_PX / height, LARGEST)
+    return [replace(view, side_px=round(factor * max(view.part_px))).around(points) for view, points in zip(views, near)]
 
 
 def _sigma(joints: JointTable, name: str) -> np.ndarray:
@@ -84,8 +97,8 @@ def _panel(
     joints: dict[str, tuple[np.ndarray, float]],
     bones: list[tuple[str, str]],
 ) -> np.ndarray:
-    """The body over one view, in the size of the camera."""
-    picture = colour(cv2.resize(grey.astype(np.float32), camera.size_px, interpolation=cv2.INTER_AREA)).astype(np.float32)
+    """The body over one view (h, w)."""
+    picture = colour(grey).astype(np.float32)
     light, covered = shade(camera, vertices_m, triangles, factor=1)
     alpha = (OPACITY * covered)[..., None]
     drawn = ((1 - alpha) * picture + alpha * light[..., None] * SKIN_COLOUR).clip(0, 255).astype(np.uint8)

@@ -11,6 +11,7 @@ import numpy as np
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
 RIGHT_X, BOTTOM_Y = WIDTH - 10, HEIGHT - BOTTOM
+END_PX = 60  # between a tick and the numbers of the first and the last frame
 COLOURS = ("#d1495b", "#2e86c1", "#28a066", "#c98a1b", "#8e5bb5", "#7a8288")  # readable on white and on black
 MOST_PER_CURVE = 1200  # frames, about two for each pixel of the width: of longer curves only the extremes of each interval are visible
 TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
@@ -29,6 +30,11 @@ for (const svg of document.querySelectorAll('svg.graph')) {
   const draw = () => {
     const k = (right - left) / (to - from)
     plot.setAttribute('transform', `translate(${left - from * k} 0) scale(${k} 1)`)
+    for (const tick of svg.querySelectorAll('.tick')) {
+      const x = left + (tick.dataset.x - from) * k
+      tick.setAttribute('transform', `translate(${x - tick.dataset.x} 0)`)
+      tick.setAttribute('visibility', x > left + 60 && x < right - 60 ? 'visible' : 'hidden')
+    }
     ends[0].textContent = `frame ${frame(from)}`
     ends[1].textContent = frame(to)
   }
@@ -55,7 +61,6 @@ for (const svg of document.querySelectorAll('svg.graph')) {
   })
   svg.addEventListener('dblclick', () => { from = left; to = right; draw() })
 }
-addEventListener('beforeprint', () => document.querySelectorAll('details').forEach(d => { d.open = true }))
 """
 
 
@@ -92,7 +97,8 @@ def curve_graph(
         plot += [f'{start} vector-effect="non-scaling-stroke" points="{_points(axes.x(f), axes.y(c))}"/>' for f, c in runs]
     dashes = [_DASHED.format(LEFT, RIGHT_X, axes.y(v), axes.y(v), COLOURS[3]) for v in limits if low < v < high]
     clipped = f'<svg x="{LEFT}" width="{RIGHT_X - LEFT}" height="{HEIGHT}" viewBox="{LEFT} 0 {RIGHT_X - LEFT} {HEIGHT}">'
-    return f'{axes.around(title, unit)}{"".join(dashes)}{clipped}<g class="plot">{"".join(plot)}</g></svg></svg>'
+    around = axes.around(title, unit, list(curves) if len(curves) > 1 else [])
+    return f'{around}{"".join(dashes)}{clipped}<g class="plot">{"".join(plot)}</g></svg></svg>'
 
 
 _DASHED = '<line x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}" stroke="{}" stroke-dasharray="4 3" vector-effect="non-scaling-stroke"/>'
@@ -114,16 +120,17 @@ class _Axes:
         low, high = self.range
         return TOP + (BOTTOM_Y - TOP) * (high - np.asarray(value)) / (high - low)
 
-    def around(self, title: str, unit: str) -> str:
-        """The beginning of the graph: its title, grid and labels, and what `SCRIPT` reads and writes."""
+    def around(self, title: str, unit: str, names: Sequence[str] = ()) -> str:
+        """The beginning of the graph: its title, the names of its curves, grid and labels, and what `SCRIPT` reads and writes."""
         (first, last), (low, high) = self._frames, self.range
         label = html.escape(f"{title} [{unit}]" if unit else title)
         data = dict(left=LEFT, right=RIGHT_X, top=TOP, bottom=BOTTOM_Y, first=first, last=max(first + 1, last), low=low, high=high)
+        key = "".join(f'<tspan dx="8" font-size="11" fill="{c}">{html.escape(name)}</tspan>' for name, c in zip(names, COLOURS))
         attributes = " ".join(f'data-{name}="{value:.8g}"' for name, value in data.items())
         parts = [
             f'<svg class="graph" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" xmlns="http://www.w3.org/2000/svg" '
             f'role="img" aria-label="{label}" {attributes} data-unit="{html.escape(unit)}" {TEXT}>'
-            f'<text x="{LEFT}" y="15" font-size="13">{label}</text>'
+            f'<text x="{LEFT}" y="15" font-size="13">{label}{key}</text>'
             f'<text class="read" x="{RIGHT_X}" y="15" text-anchor="end"></text>',
         ]
         parts += [
@@ -131,11 +138,23 @@ class _Axes:
             f'<text x="{LEFT - 6}" y="{self.y(v) + 4:.1f}" text-anchor="end">{text}</text>'
             for v, text in ticks(*self.range)
         ]
+        parts += self._frame_ticks()
         return "".join(parts) + (
             f'<line class="cross" visibility="hidden" y1="{TOP}" y2="{BOTTOM_Y}" stroke="currentColor" opacity="0.6"/>'
             f'<text class="end" x="{LEFT}" y="{HEIGHT - 8}">frame {first:.0f}</text>'
             f'<text class="end" x="{RIGHT_X}" y="{HEIGHT - 8}" text-anchor="end">{last:.0f}</text>'
         )
+
+    def _frame_ticks(self) -> list[str]:
+        """Round frames between the first and the last, as far from these as their numbers need."""
+        first, last = self._frames
+        places = [(float(self.x(v)), text) for v, text in ticks(first, last) if v == round(v)] if last > first else []
+        return [
+            f'<g class="tick" data-x="{x:.1f}"><path d="M{x:.1f} {BOTTOM_Y}v4" stroke="currentColor" opacity="0.5"/>'
+            f'<text x="{x:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{text}</text></g>'
+            for x, text in places
+            if LEFT + END_PX < x < RIGHT_X - END_PX
+        ]
 
 
 def ticks(low: float, high: float) -> list[tuple[float, str]]:

@@ -12,6 +12,7 @@ from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, shade, vertex_normals
 from .drawing import add_axes, add_scale, small_text
+from .person import Mesh
 
 PANEL_PX = (330, 520)  # width, height
 GROUND, EDGE = (28, 28, 28), (90, 90, 90)
@@ -19,14 +20,14 @@ BONE_LINE, JOINT_DOT = (200, 215, 225), (60, 190, 250)
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
 KIND_COLOURS = {BONE: (205, 225, 235), MUSCLE: (85, 85, 215), FAT: (90, 205, 240), FLESH: (120, 140, 220)}  # BGR
 DISTANCE_M, MARGIN_M = 30.0, 0.16  # far away, so that the picture is nearly to one scale
-TITLES = ("a  skeleton", "b  metaballs", "c  skin, polygons", "d  skin, shaded")
+TITLES = ("a  skeleton", "b  metaballs", "c  blended surface", "d  finished skin")
 
 
-def layers_picture(shape: BodyShape, skin: Skin) -> np.ndarray:
-    """The four layers side by side; `skin` is that of the rest pose."""
+def layers_picture(shape: BodyShape, skin: Skin, finished: Mesh) -> np.ndarray:
+    """The four layers side by side; `skin` is that of the metaballs and `finished` that of the person, both in the rest pose."""
     rest = np.zeros(len(shape.skeleton.dofs))
     camera, px_per_m = _in_front(shape, rest)
-    panels = [_skeleton(shape, rest, camera), _balls(shape, rest, camera), _polygons(skin, camera), _shaded(skin, camera)]
+    panels = [_skeleton(shape, rest, camera), _balls(shape, rest, camera), _polygons(skin, camera), _shaded(finished, camera)]
     for panel, title in zip(panels, TITLES):
         small_text(panel, title, (10, 20))
         add_scale(panel, px_per_m)
@@ -91,7 +92,7 @@ def _polygons(skin: Skin, camera: Camera) -> np.ndarray:
     return picture
 
 
-def _shaded(skin: Skin, camera: Camera) -> np.ndarray:
+def _shaded(skin: Mesh, camera: Camera) -> np.ndarray:
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = covered[..., None]
     return ((1 - alpha) * _empty() + alpha * light[..., None] * SKIN_COLOUR).clip(0, 255).astype(np.uint8)

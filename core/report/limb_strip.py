@@ -19,12 +19,12 @@ def limb_strip(frames: Sequence[int], words: Mapping[str, Sequence[str]]) -> str
     if not words or not len(frames):
         return ""
     first, count = frames[0], frames[-1] + 1 - frames[0]
-    rows = []
+    rows, now = [], f'<rect class="now" x="-9" width="{count / 90:.3f}" height="{BAR}" fill="currentColor"/>'
     for limb, row in words.items():
         bars = "".join(_bar(limb, a, b, word, first) for a, b, word in runs(frames, row))
         rows.append(
             f'<span>{html.escape(limb)}</span><svg viewBox="0 0 {count} {BAR}" preserveAspectRatio="none" role="img" '
-            f'xmlns="http://www.w3.org/2000/svg" aria-label="{html.escape(limb)} over the frames">{bars}</svg>'
+            f'xmlns="http://www.w3.org/2000/svg" aria-label="{html.escape(limb)} over the frames">{bars}{now}</svg>'
         )
     ends = f"<span></span><div><span>frame {first}</span><span>{frames[-1]}</span></div>"
     meaning = "".join(f'<i style="height:{BAR * share:.0f}px;background:{colour}"></i>{word}' for word, (colour, share) in STYLES.items())

@@ -1,66 +1,106 @@
-"""The first screen of a report: a verdict in a sentence, the body over the footage coloured by its sigmas, and doubtful frames."""
+"""The first screen of a report: a verdict in plain words, and the body over the footage coloured by the sigmas of its joints."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
-from ..body.limb_words import FEW_FRAMES, limb_words
+from ..body.limb_words import FEW_FRAMES, MOST_SPANS, SIDES, guessed_frames, limb_words
 from ..body.motion import BRIDGED, GUESSED, SEEN, SUSPECT, BodyFit
-from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
 from . import pictures
+from .person import Mesh
 
+NOT_WANTED = 'model = "none" under [body]'  # why there is no body, if the take says so
 PREDICTED = {
     BRIDGED: "the whole pose is predicted",
     SUSPECT: "residuals are large or observations few",
 }
+WHY = {  # the reasons of run.json's doubtful frames, in a sentence
+    "few points": "few points were measured",
+    "points uncertain": "the measured points are uncertain",
+    "large residuals": "the rays of matched points miss each other",
+    "few tracks": "few points were tracked",
+    "tracks uncertain": "the tracked points are uncertain",
+    "body off the points": "the body lies off the measured points",
+    "joints uncertain": "the joints are uncertain",
+    "fit bridged": "nothing was measured of the body: its pose is predicted",
+    "fit suspect": "residuals are large or observations few",
+    "fit partial": "some limbs have too few points",
+}
 SIGMAS_MM = np.array([1.0, 7.0, 50.0])  # of joints; their colours are
 COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
-LEGEND = "Colour: sigma of the joints in this frame, without what is common to all; blue 1 mm or less, yellow 7 mm, red 50 mm or more."
-CELL_PX = 300  # height of a picture of the strip
-MARGIN = 1.3  # of a picture about the body
+FLESH_M = 0.12  # from a joint
 OPACITY = 0.6
-SURROUND = 40  # grey value around an image that is smaller than its cell
 
 
-def verdict(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> str:
-    """One sentence or two on what came out, and whether it is to be trusted. `doubtful`: the number of doubtful frames."""
-    stages = record["stages"]
+def headline(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> str:
+    """Whether the result can be used, in a sentence. `doubtful`: the number of doubtful frames."""
     if body is None:
-        return " ".join([_of_surface(stages), f"No body was fitted: {stages.get('fit', {}).get('not_done', 'it was not asked for')}."])
+        why = record["stages"].get("fit", {}).get("not_done", NOT_WANTED)
+        return "Surface and trajectories, as the take asks for no body." if why == NOT_WANTED else f"No body was fitted: {why}."
+    contradicted = sorted({frame for frames in body.contradicted.values() for frame in frames})
+    if contradicted:
+        return f"The images contradict the body in {_frames(len(contradicted))}: look at these before you use them."
+    if not body.converged:
+        return "The adjustment has not converged: all figures are preliminary."
+    frames, limbs = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
+    guessed = [limb for limb, row in limbs.items() if row.count(GUESSED) > FEW_FRAMES]
+    if guessed:
+        which = "; ".join(f"the {limb} in {_spans(guessed_frames(frames, limbs[limb]))}" for limb in guessed)
+        return f"Usable, but some of it is guessed: {which}."
+    if doubtful:
+        return f"Usable, but look at {_frames(doubtful)}: the worst {'is' if doubtful == 1 else 'are'} below, with the reason."
+    return "No frame stands out as doubtful."
+
+
+def verdict(record: Mapping[str, Any], body: BodyFit | None) -> str:
+    """What came out, and how well it is known, in a few sentences."""
+    if body is None:
+        return _of_surface(record["stages"])
     motion = body.motion
     sigma, own = (1e3 * np.median(s, axis=0) for s in (motion.joint_sigma_m, motion.joint_frame_sigma_m))
     worst, frames = int(sigma.argmax()), len(motion.frames)
     limbs = limb_words(motion.joint_names, motion.known)
     predicted = {words: motion.status.count(status) for status, words in PREDICTED.items() if status in motion.status}
     if unseen := sum(any(word != SEEN for word in row) for row in zip(*limbs.values())):
-        predicted["a limb is inferred or guessed"] = unseen
-    less = "; ".join(f"in {n if n < frames else 'all'} of them {words}" for words, n in predicted.items())
-    text = (
-        f"The body was fitted in {frames} frames{f'; {less}' if less else ''}. "
-        f"Reported sigma of its joints: {np.median(sigma):.1f} mm (median; {np.median(own):.1f} mm without what is common to all frames), "
-        f"largest at {motion.joint_names[worst]} with {sigma[worst]:.0f} mm."
+        predicted["the images do not show a limb well, and its place is inferred or guessed"] = unseen
+    less = "".join(f" In {'all' if n == frames else n} of them {words}." for words, n in predicted.items())
+    return (
+        f"The body was fitted in {_frames(frames)}.{less} Its joints are known to {np.median(sigma):.1f} mm (one sigma, median). Most of "
+        f"that is the same in all frames: their motion is known to {np.median(own):.1f} mm. Least certain is the "
+        f"{joint_words(motion.joint_names[worst])}, with {sigma[worst]:.0f} mm."
     )
-    guessed = {limb: row.count(GUESSED) for limb, row in limbs.items() if row.count(GUESSED) > FEW_FRAMES}
-    if guessed:
-        named = " and the ".join(f"{limb} in {count}" for limb, count in guessed.items())
-        text = f"{text} The {named} frames {'are' if len(guessed) > 1 else 'is'} guessed."
-    contradicted = len({frame for frames in body.contradicted.values() for frame in frames})
-    if contradicted:
-        return f"{text} The images contradict it in {contradicted} frames: do not use these before you have looked at them."
-    if not body.converged:
-        return f"{text} The adjustment has not converged: the figures are preliminary."
-    return f"{text} {f'{doubtful} frames are doubtful; the worst are shown here.' if doubtful else 'No frame stands out as doubtful.'}"
+
+
+def joint_words(joint: str) -> str:
+    """A joint as people call it: "wrist.R" -> "right wrist"."""
+    name, _, side = joint.partition(".")
+    return f"{SIDES[side]} {name}" if side in SIDES else {"crown": "top of the head"}.get(name, name)
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame" if count == 1 else f"{count} frames"
+
+
+def _spans(frames: Sequence[int]) -> str:
+    """Frames as "frames 3, 5–9"."""
+    spans = list[tuple[int, int]]()
+    for frame in frames:
+        if spans and spans[-1][1] == frame - 1:
+            spans[-1] = (spans[-1][0], frame)
+        else:
+            spans.append((frame, frame))
+    words = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in spans[:MOST_SPANS])
+    return f"frame{'' if len(frames) == 1 else 's'} {words}{' …' if len(spans) > MOST_SPANS else ''}"
 
 
 def _of_surface(stages: Mapping[str, Any]) -> str:
     measured, tracked = stages.get("measure", {}), stages.get("track", {})
     if "points_per_frame" not in measured:
         return f"No surface was measured: {measured.get('not_done', 'it was not asked for')}."
-    text = f"The surface was measured in {measured['frames']} frames, with {measured['points_per_frame']:,.0f} points a frame (sigma "
+    text = f"The surface was measured in {_frames(measured['frames'])}, with {measured['points_per_frame']:,.0f} points a frame (sigma "
     points = f"{text}{measured['sigma_mm']:.2f} mm, median)"
     return f"{points} and {tracked['trajectories']:,} trajectories." if "trajectories" in tracked else f"{points}."
 
@@ -78,31 +118,19 @@ def bone_sigma_mm(body: BodyFit, index: int) -> np.ndarray:
     return np.asarray(sigma[np.array(ends)].max(axis=1))
 
 
-def window_px(camera: Camera, joints_m: np.ndarray) -> float:
-    """Side [px] of a square about the joints (J, 3) in one view, no larger than the image."""
-    return min(MARGIN * float(np.nanmax(np.ptp(camera.project(joints_m), axis=0), initial=1.0)), *camera.size_px)
-
-
-def body_by_sigma(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarray, centre_px: np.ndarray, side_px: float) -> np.ndarray:
-    """The skin over a square of one view, `side_px` wide about `centre_px`, coloured by the sigmas (B,) of its bones: uint8 (h, h, 3)."""
-    scale = CELL_PX / side_px
-    small = camera.resized((max(1, round(camera.size_px[0] * scale)), max(1, round(camera.size_px[1] * scale))))
-    image = pictures.colour(cv2.resize(grey.astype(np.float32), small.size_px, interpolation=cv2.INTER_AREA)).astype(np.float64)
-    raster = rasterize(small, skin.vertices_m, skin.triangles)
-    normal = raster.interpolate(vertex_normals(skin.vertices_m, skin.triangles), skin.triangles) @ small.R_cam_world.T
+def body_by_sigma(grey: np.ndarray, camera: Camera, skin: Mesh, sigma_mm: np.ndarray) -> np.ndarray:
+    """The skin over one view, coloured by the sigmas (B,) of its bones: uint8 (h, w, 3)."""
+    image = pictures.colour(grey).astype(np.float64)
+    raster = rasterize(camera, skin.vertices_m, skin.triangles)
+    normal = raster.interpolate(vertex_normals(skin.vertices_m, skin.triangles), skin.triangles) @ camera.R_cam_world.T
     light = 0.45 + 0.55 * np.clip(-normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12), 0, 1)
     tint = raster.interpolate(sigma_colours(skin.weights @ sigma_mm), skin.triangles)
     flat = image.reshape(-1, 3)
     flat[raster.sample] = (1 - OPACITY) * flat[raster.sample] + OPACITY * light[:, None] * tint
-    corner = np.rint((centre_px + 0.5) * scale - 0.5 - CELL_PX / 2).astype(int)
-    x, y = np.clip(corner, 0, np.maximum(0, np.array(small.size_px) - CELL_PX))  # within the image, where that is large enough
-    part = image[y : y + CELL_PX, x : x + CELL_PX].clip(0, 255).astype(np.uint8)
-    down, right = CELL_PX - part.shape[0], CELL_PX - part.shape[1]
-    around = ((down // 2, down - down // 2), (right // 2, right - right // 2), (0, 0))
-    return np.pad(part, around, constant_values=SURROUND)
+    return image.clip(0, 255).astype(np.uint8)
 
 
-def strip_frames(count: int, doubtful: Sequence[int], most: int = 6) -> list[int]:
-    """Indices of up to `most` frames, evenly over a recording of `count` frames, and those of up to three doubtful frames."""
-    even = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
-    return sorted({*even, *doubtful[:3]})
+def about_joints(camera: Camera, joints_m: np.ndarray) -> np.ndarray:
+    """Points (4 J, 3) about joints (J, 3), as far across the view as flesh may reach."""
+    steps = FLESH_M * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) @ camera.R_cam_world
+    return np.asarray((joints_m[:, None] + steps).reshape(-1, 3))

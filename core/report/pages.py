@@ -14,8 +14,6 @@ from ..body.limb_words import limb_words, sentence
 from ..body.motion import BodyFit
 from ..body.skin.contour_skin import SkinSettings, body_skin
 from ..body.skin.extremities import shape_with_ends
-from ..body.skin.mesh import Skin
-from ..body.skin.posed import skins_in
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -24,14 +22,19 @@ from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..take.footage import Footage
 from ..tracking.trajectories import Trajectories
-from . import pictures
-from .document import document, figure, notes, table
+from . import film_strip, graphs, pictures
+from .arrangement import arrangement, plan, words
+from .body_pictures import BodyPictures
+from .close_up import close_up
+from .document import SCRIPT, document, figure, notes, table
 from .figures import Row, figure_rows, figures_csv, number, quoted
-from .graphs import SCRIPT, curve_graph
+from .film_strip import CELL_PX, Shot, chosen_frames
+from .graphs import curve_graph
 from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
-from .overview import LEGEND, body_by_sigma, bone_sigma_mm, strip_frames, verdict, window_px
-from .silhouettes import OUTLINE, PERSON, Silhouettes
+from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
+from .person import Mesh, skin_in
+from .silhouettes import Silhouettes
 from .trails import trail_pictures, vector_pictures
 
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
@@ -41,8 +44,10 @@ KINDS = {  # of pictures
     "Body over the footage": ("body",),
     "Layers of the body": ("layers",),
 }
-BROAD = ("cloud", "vectors", "trails")  # of two panels
-AXES = "Axes of the reference camera: x to the right, y down, z away from it. In the rest pose: x to the person's left, z up."
+BROAD = ("vectors",)  # two pictures of two panels
+DOT = 0.3  # radius of a measured point in a picture, by the distance of neighbouring points
+AXES = "Axes of the camera: x to the right, y down, z away from it. Scales are those at the person's distance."
+REST_AXES = "Axes: x to the person's left, z up."
 SIDES = {"L": "Left", "R": "Right"}
 LABELS = {
     "points_per_frame": "points a frame",
@@ -76,6 +81,7 @@ class Report:
     body: BodyFit | None
     silhouettes: Silhouettes
     doubtful: Mapping[int, str] = field(default_factory=dict)  # frame -> why, the worst first
+    close_ups: bool = True  # pictures show the person as large as they can; otherwise whole images, for pages beside each other
 
 
 def write_report(results: Results, report: Report, monitor: Monitor, pictured: Sequence[int] = ()) -> None:
@@ -85,7 +91,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     """
     record, fits = report.record, report.silhouettes.fits
     trails = trail_pictures(results.path("trajectories_raw.npz"), report.footage.rig.cameras[report.footage.take.reference])
-    skin_at = _skin(report)
+    skin_at = skin_in(results.path("skin"), report.body, SkinSettings(**record["settings"]["skin"]))
     shown = _pictures(report, monitor, pictured, skinned=skin_at is not None) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
@@ -100,7 +106,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
     rows = figure_rows(record, report.clouds, report.trajectories, report.body, fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(report, rows, small, _strip(report, skin_at, monitor))
+    page = _page(report, rows, small, _shots(report, skin_at, monitor))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
@@ -112,53 +118,33 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     store.write_text(results.path("report", "report.html"), page)
 
 
-def _skin(report: Report) -> Callable[[np.ndarray], Skin] | None:
-    """The skin in a pose; None without a body, or for a body without a skin, of which the run has warned."""
-    if report.body is None:
-        return None
-    settings = SkinSettings(**report.record["settings"]["skin"])
-    try:
-        return skins_in(shape_with_ends(report.body.shape, settings), report.body.motion.values, settings)
-    except InputError:
-        return None
-
-
 def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skinned: bool) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
-    footage, record, clouds, trajectories = report.footage, report.record, report.clouds, report.trajectories
-    body, silhouettes = report.body, report.silhouettes
+    footage, clouds, trajectories = report.footage, report.clouds, report.trajectories
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
-    settings = SkinSettings(**record["settings"]["skin"])
+    spacing = report.record["settings"]["growing"]["spacing_px"]
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
-    total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
-
-    def add(name: str, caption: str, picture: np.ndarray) -> None:
-        found[name] = (caption, picture)
-        monitor.step("report", len(found), total)
-
-    for i in chosen:
+    near = close_up(camera, [clouds[i].xyz_m for i in chosen] if report.close_ups else [])
+    settings = SkinSettings(**report.record["settings"]["skin"])
+    bodies = BodyPictures(report.body if skinned else None, report.silhouettes, settings, footage.rig, chosen, near=report.close_ups)
+    for n, i in enumerate(chosen):
+        monitor.step("report", n, 2 * len(chosen))
         cloud = clouds[i]
-        images, sigma, frame = footage.read(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame
-        high = float(np.percentile(sigma, 95)) if len(sigma) else 1.0
-        measured = f"{len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)"
-        on_image = pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)
-        add(f"surface_{frame:04d}.png", f"Frame {frame}, view {view}: {measured}", pictures.with_scale(on_image, camera, cloud.xyz_m))
-        from_sides = pictures.cloud_views(cloud, camera, record["settings"]["growing"]["spacing_px"])
-        add(f"cloud_{frame:04d}.png", f"Frame {frame}: the cloud from the front and from its right side", from_sides)
+        images, sigma, frame, part = footage.read_whole(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame, near.around(cloud.xyz_m)
+        high, grey = float(np.percentile(sigma, 95)) if len(sigma) else 1.0, part.image(images[ref])
+        at, radius = part.pixels(cloud.xy_px[:, ref]), max(1, round(DOT * spacing * part.scale))
+        over = pictures.points_over_footage(grey, at, sigma, high, "sigma, mm", radius)
+        caption = f"Frame {frame}, view {view}: {len(sigma):,} measured points, coloured by their sigma; red: {high:.2g} mm or more"
+        found[f"surface_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+        from_sides = pictures.cloud_views(cloud, camera, spacing)
+        found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
-            caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
-            on_image = pictures.tracks_over_footage(images[ref], camera, trajectories, i)
-            add(f"tracks_{frame:04d}.png", caption, pictures.with_scale(on_image, camera, cloud.xyz_m))
-        if body is not None and skinned:
-            skin = body_skin(shape_with_ends(body.shape, settings), body.motion.values[i], settings)  # exact, as the silhouettes' figures
-            for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
-                person = silhouettes.outlines.get(name, {}).get(frame)
-                picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
-                pictures.with_scale(picture, cam, body.motion.joints_m[i])
-                agreement = _agreement_caption(silhouettes, name, frame)
-                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{agreement}", picture)
+            caption = f"Frame {frame}, view {view}: the paths of the points over the last {pictures.TAIL_FRAMES} frames, coloured by speed"
+            over = pictures.tracks_over_footage(grey, part.camera, trajectories, i)
+            found[f"tracks_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+        found |= bodies.of_frame(i, images)
     return found
 
 
@@ -169,73 +155,66 @@ def _first_middle_last(report: Report) -> list[int]:
     return sorted({0, min(sorted(compared), key=lambda i: abs(i - count // 2)), count - 1})
 
 
-def _layers(report: Report, skin_at: Callable[[np.ndarray], Skin] | None) -> dict[str, tuple[str, np.ndarray]]:
+def _layers(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None) -> dict[str, tuple[str, np.ndarray]]:
     """The picture of the body's layers; none without a skin."""
     if report.body is None or skin_at is None:
         return {}
-    shape = report.body.shape
-    rest = skin_at(np.zeros(len(shape.skeleton.dofs)))
+    shape, rest = report.body.shape, np.zeros(len(report.body.shape.skeleton.dofs))
+    settings = SkinSettings(**report.record["settings"]["skin"])
     words = "The fitted body in its rest pose, from the front: skeleton; metaballs, each as the ellipsoid that it shows alone "
-    caption = f"{words}({kinds_shown(shape)}); polygons of the skin that blends them; the skin shaded"
-    return {"layers.png": (caption, layers_picture(shape, rest))}
+    caption = f"{words}({kinds_shown(shape)}); polygons of the surface that blends them; the finished skin"
+    return {"layers.png": (caption, layers_picture(shape, body_skin(shape_with_ends(shape, settings), rest, settings), skin_at(rest)))}
 
 
-def _agreement_caption(silhouettes: Silhouettes, view: str, frame: int) -> str:
-    """The silhouette's part of a caption."""
-    found = [f for f in silhouettes.fits if (f.view, f.frame) == (view, frame)]
-    if not found:
-        return ""
-    drawn = " (red)" if found[0].person == OUTLINE else ""
-    fit = found[0]
-    agreement = f"IoU {fit.iou:.3f} with" if silhouettes.whole else f"{100 * fit.inside:.1f} % of it inside"
-    return f" and its outline (green); {agreement} {PERSON[fit.person]}{drawn}"
-
-
-def _strip(report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor: Monitor) -> list[tuple[str, bytes]]:
-    """Captions and pictures of the body over the footage of the reference view, in frames all over the recording and in doubtful ones."""
+def _shots(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None, monitor: Monitor) -> list[Shot]:
+    """The body over the footage of the reference view, in frames all over the recording and in doubtful ones."""
     body, footage = report.body, report.footage
     if body is None or skin_at is None:
         return []
     k = footage.take.reference
     camera, frames = footage.rig.cameras[k], body.motion.frames.tolist()
-    chosen = strip_frames(len(frames), [frames.index(frame) for frame in report.doubtful if frame in frames])
+    chosen, keys = chosen_frames(len(frames), [frames.index(frame) for frame in report.doubtful if frame in frames])
+    about = [about_joints(camera, body.motion.joints_m[i]) for i in chosen]
+    near = close_up(camera, about, CELL_PX)
     found = []
-    for i in chosen:
-        monitor.step("report", 1, 2)
-        centre, grey = camera.project(body.motion.joints_m[i]), footage.read(frames[i])[k]
-        middle = 0.5 * (np.nanmin(centre, axis=0) + np.nanmax(centre, axis=0))
-        skin, side = skin_at(body.motion.values[i]), window_px(camera, body.motion.joints_m[i])
-        picture = body_by_sigma(grey, camera, skin, bone_sigma_mm(body, i), middle, side)
-        why = f": {report.doubtful[frames[i]]}" if frames[i] in report.doubtful else ""
-        found.append((f"Frame {frames[i]}{why}", pictures.jpeg(picture)))
+    for n, i in enumerate(chosen):
+        monitor.step("report", len(chosen) + n, 2 * len(chosen))
+        part = near.around(about[n])
+        grey = part.image(footage.read_whole(frames[i])[k])
+        picture = pictures.jpeg(body_by_sigma(grey, part.camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i)))
+        reason = report.doubtful.get(frames[i], "")
+        why = f": {WHY.get(reason, reason)}" if reason else ""
+        found.append(Shot(frame=frames[i], caption=f"Frame {frames[i]}{why}", picture=picture, key=i in keys))
     return found
 
 
 def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:
-    """The overlap over the frames, view by view."""
+    """The overlap over the frames, all views in one graph."""
     fits, measure = silhouettes.fits, "IoU of the silhouette" if silhouettes.whole else "Share of the silhouette inside the person's"
-    views = list(dict.fromkeys(f.view for f in fits))
-    tables = {view: np.array([(f.frame, f.overlap) for f in fits if f.view == view]) for view in views}
-    return [curve_graph(f"{measure}, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
+    frames = sorted({f.frame for f in fits})
+    curves = {f"view {view}": np.full(len(frames), np.nan) for view in dict.fromkeys(f.view for f in fits)}
+    for fit in fits:
+        curves[f"view {fit.view}"][frames.index(fit.frame)] = fit.overlap
+    return [curve_graph(measure, "", np.array(frames), curves)] if curves else []
 
 
 def _measurement_graphs(report: Report) -> list[str]:
     clouds, trajectories = report.clouds, report.trajectories
     rows = [(c.frame, len(c.xyz_m), finite_median(c.residual_px), 1e3 * finite_median(c.sigma_m)) for c in clouds]
     frames, points, residual, sigma = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    graphs = [
+    found = [
         curve_graph("Measured points", "", frames, {"points": points}),
         curve_graph("Residual of the rays (median)", "px", frames, {"residual": residual}),
         curve_graph("Sigma of the points (median)", "mm", frames, {"sigma": sigma}),
     ]
     if trajectories is not None:
-        graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
+        found.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
         for title, unit, vectors in (
-            ("Speed of the tracked points: median (red), 95 % (blue)", "m/s", trajectories.velocity_m_s),
-            ("Acceleration of the tracked points: median (red), 95 % (blue)", "m/s²", trajectories.acceleration_m_s2),
+            ("Speed of the tracked points", "m/s", trajectories.velocity_m_s),
+            ("Acceleration of the tracked points", "m/s²", trajectories.acceleration_m_s2),
         ):
-            graphs.append(curve_graph(title, unit, trajectories.frames, _typical(vectors)))
-    return graphs
+            found.append(curve_graph(title, unit, trajectories.frames, _typical(vectors)))
+    return found
 
 
 def _typical(vectors: np.ndarray) -> dict[str, np.ndarray]:
@@ -247,15 +226,6 @@ def _typical(vectors: np.ndarray) -> dict[str, np.ndarray]:
         if len(size):
             found[:, t] = np.percentile(size, [50, 95])
     return {"median": found[0], "95 %": found[1]}
-
-
-def _limbs(body: BodyFit | None) -> str:
-    """In which frames each limb was seen, inferred or guessed."""
-    if body is None:
-        return ""
-    frames, words = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
-    lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
-    return f'<h2>Limbs</h2>{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
 
 
 def _limb_graphs(report: Report) -> dict[str, list[str]]:
@@ -284,46 +254,87 @@ def limb_of(dof: str) -> str:
     return f"{SIDES[side]} {limb}" if limb and side in SIDES else "Trunk and head"
 
 
-def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], strip: Sequence[tuple[str, bytes]]) -> str:
+def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], shots: Sequence[Shot]) -> str:
     """The whole page. Names of the take, its views and its files are text, wherever they come from."""
-    record, take = report.record, html.escape(report.record["take"].rsplit("/", 1)[-1])
-    facts = (
-        f"{len(record['views'])} views ({', '.join(record['views'])}), frames {record['frames'][0]} to {record['frames'][1] - 1}, "
-        f"{record['fps']:g} frames/s, interlaced: {record['interlaced']}"
+    record, take = report.record, report.record["take"].rsplit("/", 1)[-1]
+    sections = [*_picture_sections(files), ("Over time", _over_time(report)), ("All figures", _all_figures(record, rows))]
+    if recorded := _recording(report):
+        sections.insert(0, ("Cameras and person", recorded))
+    links = " · ".join(f'<a href="#part{n}">{title}</a>' for n, (title, _) in enumerate(sections))
+    body = (
+        f'<h1>{html.escape(take)}</h1><p class="verdict"><b>{html.escape(headline(record, report.body, len(report.doubtful)))}</b> '
+        f'{html.escape(verdict(record, report.body))}</p><p class="soft">{html.escape(_facts(record))}</p>'
+        + notes([*filter(None, [record.get("reference_note")]), *record["warnings"]])
+        + _first_screen(report, shots)
+        + f"<nav>{links}</nav>"
+        + "".join(f'<h2 id="part{n}">{title}</h2>{content}' for n, (title, content) in enumerate(sections))
     )
-    cells = "".join(figure(caption, picture) for caption, picture in strip)
+    return document(f"Tricap: {take}", body, f"{SCRIPT}{graphs.SCRIPT}{film_strip.SCRIPT}")
+
+
+def _facts(record: Mapping[str, Any]) -> str:
+    """What was recorded, in a line."""
+    (first, end), fps, lines = record["frames"], record["fps"], record["interlaced"]
+    how = "" if lines == "none" else f" · interlaced video, {'both fields' if lines == 'both' else f'its {lines} lines'}"
+    views = f"{len(record['views'])} views ({', '.join(record['views'])})"
+    span = f"frames {first} to {end - 1}, {(end - first) / fps:.2f} s at {fps:g} frames/s" if end - first > 1 else f"frame {first}"
+    return f"{views} · {span}{how}"
+
+
+def _first_screen(report: Report, shots: Sequence[Shot]) -> str:
+    """The film of the body with the limbs beside it; the limbs alone for a body without a skin."""
+    if report.body is None:
+        return ""
+    frames, words = report.body.motion.frames.tolist(), limb_words(report.body.motion.joint_names, report.body.motion.known)
+    lines = "<br>".join(html.escape(sentence(limb, frames, row)) for limb, row in words.items())
+    limbs = f'{limb_strip(frames, words)}<p class="soft">{MEANING}</p><p class="soft">{lines}</p>'
+    if not shots:
+        return limbs
+    start = next((frame for frame in report.doubtful if frame in frames), frames[len(frames) // 2])
+    return film_strip.film(shots, report.record["fps"], start, f"{film_strip.legend()}{limbs}")
+
+
+def _recording(report: Report) -> str:
+    """Cameras and person from above; "" if nothing was measured."""
+    footage = report.footage
+    shown = arrangement(footage.rig, footage.take.reference, report.clouds) if len(report.clouds) else None
+    return f'<div class="first">{plan(shown)}<p>{html.escape(words(shown))}</p></div>' if shown else ""
+
+
+def _picture_sections(files: Mapping[str, tuple[str, bytes]]) -> list[tuple[str, str]]:
+    """Titles and pictures of the papers' figures."""
     found = {
         kind: [figure(*files[name]) for name in files if name.startswith((f"{kind}_", f"{kind}."))] for kind in sum(KINDS.values(), ())
     }
-    shown = "".join(
-        f"<h2>{title}</h2>{''.join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])}"
-        for title, kinds in KINDS.items()
-        if any(found[kind] for kind in kinds)
+    sections = [(title, "".join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])) for title, kinds in KINDS.items()]
+    axes = {title: REST_AXES if "layers" in kinds else AXES for title, kinds in KINDS.items()}
+    return [(title, f'{content}<p class="soft">{axes[title]}</p>') for title, content in sections if content]
+
+
+def _over_time(report: Report) -> str:
+    """The graphs, those of limbs folded."""
+    limbs = "".join(_folded(limb, _grid(curves)) for limb, curves in _limb_graphs(report).items() if any(curves))
+    curves = _grid(_measurement_graphs(report) + _silhouette_graphs(report.silhouettes))
+    return (
+        '<p class="soft">Point at a curve to read it, drag over a range to enlarge it, double-click to see all. Bands: one sigma. Dashed: '
+        f"limits of the joint, and frames with clicks.</p>{curves}{limbs}"
     )
-    limbs = "".join(_folded(limb, _grid(graphs)) for limb, graphs in _limb_graphs(report).items() if any(graphs))
+
+
+def _all_figures(record: Mapping[str, Any], rows: Sequence[Row]) -> str:
     settings = "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
-    graphs = _grid(_measurement_graphs(report) + _silhouette_graphs(report.silhouettes))
     stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in record["stages"].items())
-    body = (
-        f'<h1>{take}</h1><p class="verdict">{html.escape(verdict(record, report.body, len(report.doubtful)))}</p>'
-        f'<p class="soft">{html.escape(facts)}</p>'
-        + (f'<div class="row cells">{cells}</div><p class="soft">{LEGEND}</p>' if cells else "")
-        + notes([*filter(None, [record.get("reference_note")]), *record["warnings"]])
-        + _limbs(report.body)
-        + f'{shown}<p class="soft">{AXES}</p><h2>Over time</h2><p class="soft">Point at a curve to read it, drag over '
-        "a range to enlarge it, double-click to see all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"
-        f"{graphs}{limbs}<h2>All figures</h2>"
-        + _folded("Figures (also in report.json and figures.csv)", _quotable(rows))
-        + _folded("Stages", f"<table>{stages}</table>")
+    return (
+        _folded("Figures (also in report.json and figures.csv)", _quotable(rows))
+        + _folded("Stages", f'<div class="wide"><table>{stages}</table></div>')
         + _folded("To repeat it", f"<pre>{html.escape(str(record.get('repeat', '')))}</pre>")
         + _folded("Settings", f"<pre>{html.escape(settings)}</pre>")
     )
-    return document(f"Tricap: {report.record['take'].rsplit('/', 1)[-1]}", body, SCRIPT)
 
 
 def _picture_row(kind: str, figures: Sequence[str]) -> str:
-    """Figures beside each other; those that have two or four panels are wider."""
-    width = "single" if len(figures) == 1 else "broad" if kind in BROAD else ""
+    """Figures beside each other; those that have several panels are wider."""
+    width = "single" if kind == "layers" else "broad" if kind in BROAD or len(figures) < 3 else ""
     return f'<div class="row {width}">{"".join(figures)}</div>'
 
 

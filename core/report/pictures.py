@@ -1,7 +1,5 @@
 """Pictures of a run: the fitted body over the footage, trajectories over the footage, the cloud from the front and from the side."""
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
@@ -13,16 +11,19 @@ from ..geometry.raster import shade
 from ..geometry.robust import finite_median
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
-from .drawing import add_axes, add_scale
+from .drawing import OF_PANELS, add_axes, add_colour_bar, add_scale, value_colours
 from .silhouettes import outlines_of
 
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
 BONE_COLOUR, JOINT_COLOUR = (60, 60, 230), (40, 220, 255)
 BODY_OUTLINE, PERSON_OUTLINE = (60, 220, 60), (40, 40, 240)
 OPACITY = 0.55
-PANEL_PX = 480
+PANEL_PX = 480  # height of a cloud's picture, and width of each of its two panels …
+NARROW_PX = 300  # … or this, for somebody who stands
 LIGHT = np.array([-0.45, -0.55, -0.70])  # towards the light of a cloud from the front: upper left
+SIDE_LIGHT = np.array([0.82, -0.40, -0.40])  # from the side: from where the cameras are, at the right
 TAIL_FRAMES = 10
+SLOW_M_S = 0.2  # the speed of red points is at least this
 
 
 def body_over_footage(
@@ -63,11 +64,13 @@ def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajecto
     visible = trajectories.visible[index]
     paths = camera.project(trajectories.xyz_m[first : index + 1, visible])
     speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, visible], axis=1))
-    colours = _colours(speed, 0.0, max(0.2, float(np.percentile(speed, 98)) if len(speed) else 0.2))
-    for xy, c in zip(paths.transpose(1, 0, 2), colours):
+    high = max(SLOW_M_S, float(np.percentile(speed, 98)) if len(speed) else 0.0)
+    for xy, c in zip(paths.transpose(1, 0, 2), value_colours(speed, 0.0, high).tolist()):
         xy = xy[np.isfinite(xy).all(axis=1)]
         cv2.polylines(picture, [np.rint(xy * 8).astype(np.int32)], False, c, 1, cv2.LINE_AA, 3)
-        cv2.circle(picture, _point(xy[-1]), 1, c, -1, cv2.LINE_AA)
+        cv2.circle(picture, _point(xy[-1]), 2, c, -1, cv2.LINE_AA)
+    if len(speed):
+        add_colour_bar(picture, high, "speed, m/s")
     return picture
 
 
@@ -83,29 +86,33 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     radius = max(1, round(0.9 * spacing_px * float(centre[2]) / camera.focal_px * scale))
     front = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     side = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-    lit = ((front, LIGHT), (side, LIGHT * (-1, 1, 1)))  # from the side of the cameras, to which the normals point
-    pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius, light) for R, light in lit]
+    lit = ((front, LIGHT), (side, SIDE_LIGHT))
+    across = float(np.percentile(np.abs(p - centre)[:, [0, 2]], 99)) * scale
+    width = NARROW_PX if across < 0.46 * NARROW_PX else PANEL_PX
+    pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius, light, width) for R, light in lit]
     for picture, names in zip(pair, (("x", "y"), ("z", "y"))):
-        add_scale(picture, scale)
-        add_axes(picture, names, left=names[0] == "z")
+        add_scale(picture, scale, size=OF_PANELS)
+        add_axes(picture, names, left=names[0] == "z", size=OF_PANELS)
     return np.hstack(pair)
 
 
-def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int, light: np.ndarray) -> np.ndarray:
+def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int, light: np.ndarray, width: int) -> np.ndarray:
     """Points as discs, far ones first, lit along a unit vector (3,)."""
-    picture = np.full((PANEL_PX, PANEL_PX, 3), 28, np.uint8)
+    picture = np.full((PANEL_PX, width, 3), 28, np.uint8)
     grey = 60 + 195 * np.clip(n @ light, 0, 1)
     for i in np.argsort(-p[:, 2]):
-        at = (round(PANEL_PX / 2 + p[i, 0] * scale), round(PANEL_PX / 2 + p[i, 1] * scale))
+        at = (round(width / 2 + p[i, 0] * scale), round(PANEL_PX / 2 + p[i, 1] * scale))
         cv2.circle(picture, at, radius, (grey[i] * 0.85, grey[i] * 0.95, float(grey[i])), -1)
     return picture
 
 
-def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Matched points over one view, coloured by a value from blue (low) to red (high)."""
+def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray, high: float, words: str, radius: int = 1) -> np.ndarray:
+    """Matched points over one view, coloured by a value from blue (0) to red (high); `words` are those of the bar of colours."""
     picture = colour(grey)
-    for xy, c in zip(xy_px, _colours(values, low, high)):
-        cv2.circle(picture, _point(xy), 1, c, -1, cv2.LINE_AA)
+    for xy, c in zip(xy_px, value_colours(values, 0.0, high).tolist()):
+        cv2.circle(picture, _point(xy), radius, c, -1, cv2.LINE_AA)
+    if len(values):
+        add_colour_bar(picture, high, words)
     return picture
 
 
@@ -132,14 +139,6 @@ def png(picture: np.ndarray) -> bytes:
 def jpeg(picture: np.ndarray) -> bytes:
     """A picture as JPEG, for pages that carry many."""
     return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
-
-
-def _colours(values: np.ndarray, low: float, high: float) -> Sequence[tuple[int, int, int]]:
-    if not len(values):
-        return []
-    index = np.clip(255 * (values - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
-    table = cv2.applyColorMap(index.reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
-    return [(int(b), int(g), int(r)) for b, g, r in table]
 
 
 def _point(xy: np.ndarray) -> tuple[int, int]:

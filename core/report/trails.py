@@ -11,7 +11,7 @@ from ..geometry.camera import Camera
 from ..tracking.reasons import COLOUR_WORDS, REASON_COLOURS
 from ..tracking.settings import TrackStatus
 from ..tracking.trajectories import Trajectories
-from .drawing import add_axes, add_scale
+from .drawing import OF_PANELS, add_axes, add_colour_bar, add_scale, value_colours
 
 SIDE_PX = 360
 MOST_ARROWS = 700  # in one picture; of more, every n-th point
@@ -74,7 +74,8 @@ def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> l
         pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
         words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
-        found.append((f"{words}; blue 0, red {longest:.2g} {unit} or more, an arrow that long", np.hstack(pair)))
+        add_colour_bar(pair[0], longest, f"{name}, {unit.replace('²', '^2')}")
+        found.append((f"{words}; red and longest: {longest:.2g} {unit} or more", np.hstack(pair)))
     return found
 
 
@@ -83,7 +84,7 @@ def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tu
     picture, (middle, half) = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8), limits
     rows, signs = (0, 1) if axes == "xy" else (2, 1), np.array([1.0 if axes == "xy" else -1.0, 1.0])
     start, end = (SIDE_PX / 2 * (1 + (p[:, rows] - middle[list(rows)]) * signs / half) for p in (place, place + arrows))
-    tints = cv2.applyColorMap(np.clip(255 * share, 0, 255).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
+    tints = value_colours(share, 0.0, 1.0)
     ends = np.clip(np.rint(8 * np.stack([start, end], axis=1)), -(2**20), 2**20).astype(int)
     for (a, b), tint in zip(ends.tolist(), tints.tolist()):
         cv2.arrowedLine(picture, a, b, tint, 1, cv2.LINE_AA, 3, 0.3)
@@ -116,6 +117,6 @@ def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: floa
     lines, colour = np.rint(8 * np.stack([pixel[:-1][step], pixel[1:][step]], axis=1)).astype(np.int32), colours[1:][step]
     for one in np.unique(colour, axis=0):
         cv2.polylines(picture, list(lines[(colour == one).all(axis=1)]), False, one.tolist(), 1, cv2.LINE_AA, 3)
-    add_scale(picture, SIDE_PX / 2 / half_m)
-    add_axes(picture, names, left=names[0] == "z")
+    add_scale(picture, SIDE_PX / 2 / half_m, size=OF_PANELS)
+    add_axes(picture, names, left=names[0] == "z", size=OF_PANELS)
     return picture

@@ -17,13 +17,14 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median, mad_sigma
 from ..motion.formats.ply import read_ply
-from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page
+from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page, written
 from ..results.folder import Results, check_inside, check_separate_folder
 from . import pipeline
 from .settings import Overrides
 from .take_run import open_run
 
 PLACE_M = 0.02  # edge of the cubes in which coverage is counted
+SURFACE, TRACKS, BODY, TIME = "Surface", "Trajectories", "Body", "Time"  # groups of measures
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 
@@ -45,6 +46,7 @@ def run_both(
         with open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart) as run:
             if not pipeline.is_complete(run):
                 monitor.begin(method)
+                run.close_ups = False  # the same part of the images in both reports
                 pipeline.all_stages(run, monitor)
     return [out / method for method in METHODS]
 
@@ -74,16 +76,16 @@ def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
         return 100 * (1 - track.get("reasons", {}).get("measured", 0) / started) if started else float("nan")
 
     wanted = (
-        ("points a frame", "", HIGHER, lambda s: s.get("measure", {}).get("points_per_frame")),
-        ("residual of the rays (median)", "px", NEITHER, lambda s: s.get("measure", {}).get("residual_px")),
-        ("trajectories", "", NEITHER, lambda s: s.get("track", {}).get("trajectories")),
-        ("length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
-        ("trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
-        ("reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
-        ("duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
+        (SURFACE, "points a frame", "", HIGHER, lambda s: s.get("measure", {}).get("points_per_frame")),
+        (SURFACE, "residual of the rays (median)", "px", NEITHER, lambda s: s.get("measure", {}).get("residual_px")),
+        (TRACKS, "trajectories", "", NEITHER, lambda s: s.get("track", {}).get("trajectories")),
+        (TRACKS, "length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
+        (TRACKS, "trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
+        (BODY, "reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
+        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
     )
     values = [[float(v) if (v := of(run["stages"])) is not None else float("nan") for run in runs] for *_, of in wanted]
-    return [Measure(name=n, unit=u, published=a, default=b, better=c) for (n, u, c, _), (a, b) in zip(wanted, values)]
+    return [Measure(group=g, name=n, unit=u, published=a, default=b, better=c) for (g, n, u, c, _), (a, b) in zip(wanted, values)]
 
 
 def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
@@ -102,8 +104,10 @@ def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
     columns = np.array([share, noise]).reshape(2, -1, 2)
     (a, b), (c, d) = ([finite_median(table[:, k]) for k in (0, 1)] for table in columns)
     return [
-        Measure(name="coverage of the places that either measured", unit="%", published=a, default=b, better=HIGHER),
-        Measure(name="noise of a point about the surface through its neighbours", unit="mm", published=c, default=d, better=LOWER),
+        Measure(group=SURFACE, name="coverage of the places that either measured", unit="%", published=a, default=b, better=HIGHER),
+        Measure(
+            group=SURFACE, name="noise of a point about the surface through its neighbours", unit="mm", published=c, default=d, better=LOWER
+        ),
     ]
 
 
@@ -129,4 +133,4 @@ def as_lines(measures: Sequence[Measure]) -> list[str]:
     """The measures as a table of text."""
     width = max(len(m.name) for m in measures)
     rows = [f"{'':<{width}}  {PUBLISHED:>10}  {DEFAULT:>10}"]
-    return rows + [f"{m.name:<{width}}  {m.published:>10.4g}  {m.default:>10.4g}  {m.unit}" for m in measures]
+    return rows + [f"{m.name:<{width}}  {written(m.published):>10}  {written(m.default):>10}  {m.unit}" for m in measures]

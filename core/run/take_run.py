@@ -46,6 +46,7 @@ class Run:
     silhouettes: Silhouettes = field(default_factory=Silhouettes)
     engine: Engine | None = None  # where the frames are measured; None: in this process
     pictured: Sequence[int] = ()  # the frames of the report's pictures; none: the first, a middle and the last
+    close_ups: bool = True  # of the person, in the report
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)

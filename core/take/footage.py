@@ -90,6 +90,15 @@ class Footage:
         """
         return self._checked(frame, in_threads(lambda k: self.sequences[k].read(self.number(k, frame)), range(len(self.sequences))))
 
+    def read_whole(self, frame: int) -> list[np.ndarray]:
+        """The same for the eye: the rows of the other field are interpolated.
+
+        Raises:
+            InputError: as `read`.
+        """
+        rows = self.take.rows_at(frame)
+        return [rows.whole(image) for image in self.read(frame)]
+
     def read_colour(self, frame: int) -> list[np.ndarray]:
         """The RGB images (h, w, 3) float32 of all views at one frame of the take; the rows of the other field are interpolated.
 

@@ -112,6 +112,33 @@ def test_a_point_in_one_view_is_followed_there(blender: ModuleType, scene: Any, 
     assert module("points.tracks").joined(clip) == [], "pressed again, they are separated"
 
 
+def test_a_clip_without_a_take(empty: ModuleType, arm_take: Path, truth: Truth, tmp_path: Path) -> None:
+    """2-D needs neither cameras nor a take: the table is written next to the Blender file, which must be saved."""
+    clip = empty.data.movieclips.load(str(sorted((arm_take / "C").glob("*.png"))[0]))
+    clip.frame_start = 0
+    empty.context.scene.frame_set(0)
+    camera, vertex = importlib.import_module("tricap.core.geometry.rig").read_rig(arm_take / "rig.toml")["C"], cloth(truth, 1, 0)
+    x, y = camera.project(truth.vertices_m[0, vertex])
+    assert empty.ops.tricap.click_point(name="point 1", clip=clip.name, x=x, y=y) == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="Save the Blender file first"):
+        empty.ops.tricap.follow_points2d(clip=clip.name)
+    empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "face.blend"))
+    clip = empty.data.movieclips[0]
+    assert empty.ops.tricap.follow_points2d(clip=clip.name) == {"FINISHED"}
+    (table,) = (tmp_path / "face_tricap" / "results" / "planar").glob("*.csv")
+    found = importlib.import_module("tricap.core.tracking.point_tables").read_planar(table)
+    assert np.linalg.norm(found.xy_px[:, 0] - camera.project(truth.vertices_m[:, vertex]), axis=1).max() < 1.5
+
+
+def test_what_is_told_in_the_end(scene: Any) -> None:
+    """The next button; in 2-D there are no other views."""
+    operator = SimpleNamespace(session=SimpleNamespace(frame=3), flat=True)
+    result = module("points.click").ClickPoints.result
+    assert result(operator, 2).startswith("Frame 3: 2 new points. Press Follow in This View (2-D)")
+    operator.flat = False
+    assert result(operator, 1) == "Frame 3: 1 new point, clicked in two or more views. Press Follow Points."
+
+
 def test_what_is_refused(blender: ModuleType, scene: Any) -> None:
     with pytest.raises(RuntimeError, match="No points are clicked in frame 1"):
         blender.ops.tricap.follow_points()

@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import shutil
+import webbrowser
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from pathlib import Path
@@ -469,6 +470,19 @@ def test_everything_is_offered_only_when_nothing_else_is_next(blender: ModuleTyp
     assert offered == [True, False, True]
 
 
+def test_the_report_is_opened_in_the_browser(blender: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also from a folder whose name is no URL; without a report, what makes one is named."""
+    opened(blender, sample, tmp_path).tricap.out = str(tmp_path / "mes résultats #1")
+    shown: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda url, *rest: shown.append(url))
+    with pytest.raises(RuntimeError, match="no report yet: it is written at the end of Fit Body"):
+        blender.ops.tricap.open_report()
+    page = tmp_path / "mes résultats #1" / "report" / "report.html"
+    page.parent.mkdir(parents=True)
+    page.write_text("<h1>report</h1>")
+    assert blender.ops.tricap.open_report() == {"FINISHED"} and shown == [page.as_uri()] and "%231" in shown[0]
+
+
 def test_the_untouched_cube_makes_room(blender: ModuleType) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     aside, said = importlib.import_module(f"{NAME}.operators.build_scene"), []
@@ -480,7 +494,7 @@ def test_the_untouched_cube_makes_room(blender: ModuleType) -> None:
         for name, value in change.items():
             setattr(cube, name, value)
         blender.context.view_layer.update()
-        aside._hide_default_objects(operator, blender.context)
+        aside.hide_default_objects(operator, blender.context)
         found = bool(cube.hide_get())
         assert cube.hide_render == found
         blender.data.objects.remove(cube)

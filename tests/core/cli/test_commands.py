@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tricap.core.calibration.rig_files import write_as
-from tricap.core.cli import main
+from tricap.core.cli import main, stages
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.rig import read_rig
@@ -409,6 +409,11 @@ def test_a_finished_run_is_not_computed_again(take: Path, tmp_path: Path, capfd:
     assert main.main(argv) == 0 and not computed and (out / "run.json").read_bytes() == before
     said = capfd.readouterr().out
     assert "Nothing has changed" in said and "2 frames" in said and "No body was fitted" in said
+    with monkeypatch.context() as blender:
+        built: list[int] = []
+        blender.setattr(stages, "_has_scene", lambda *_: False)
+        blender.setattr(stages, "_build_scene", lambda *_: [str(built.append(1))])
+        assert main.main([*argv, "--quiet"]) == 0 and built and not computed, "the Blender file alone is missing: it alone is made"
     for more in (["--restart"], ["--pictures", "1"], ["--set", "growing.spacing_px=5"]):
         shutil.copytree(out, tmp_path / "copy", dirs_exist_ok=True)
         main.main(["run", str(take), "--out", str(tmp_path / "copy"), "--frames", "0:2", *more, "--quiet"])

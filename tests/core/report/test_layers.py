@@ -10,13 +10,15 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.contour_skin import body_skin
 from tricap.core.report.drawing import add_axes, add_scale, length_words
 from tricap.core.report.layers import GROUND, KIND_COLOURS, PANEL_PX, kinds_shown, layers_picture
+from tricap.core.report.person import Mesh
 
 
 @pytest.fixture(scope="module")
 def panels() -> list[np.ndarray]:
     shape = complete_shape(default_shape(read_model("arm.R")))
     assert kinds_shown(shape) == "white: bone, red: muscle" and "flesh" in kinds_shown(default_shape(read_model("arm.R")))
-    picture = layers_picture(shape, body_skin(shape, np.zeros(len(shape.skeleton.dofs))))
+    skin = body_skin(shape, np.zeros(len(shape.skeleton.dofs)))
+    picture = layers_picture(shape, skin, Mesh(vertices_m=skin.vertices_m, triangles=skin.triangles, weights=skin.weights))
     assert picture.shape == (PANEL_PX[1], 4 * PANEL_PX[0], 3)
     return np.split(picture, 4, axis=1)
 

@@ -4,9 +4,11 @@ import json
 import re
 import shutil
 import subprocess
+import xml.etree.ElementTree as ET
 from base64 import b64encode
 from dataclasses import replace
 from hashlib import sha256
+from html import unescape
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,20 +17,25 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.body.motion import BodyFit, BodyMotion
+from tricap.core.body.motion import BRIDGED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from tricap.core.body.shape import default_shape
-from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.body.skin.contour_skin import SkinSettings
 from tricap.core.foundation import store
 from tricap.core.report import overview
+from tricap.core.report.arrangement import arrangement, plan, words
+from tricap.core.report.close_up import alike, close_up
 from tricap.core.report.document import STYLE, document, figure, notes, table
 from tricap.core.report.figures import figures_csv
+from tricap.core.report.film_strip import MOST_FRAMES, Shot, chosen_frames
 from tricap.core.report.graphs import SCRIPT, curve_graph
 from tricap.core.report.limb_strip import limb_strip
-from tricap.core.report.overview import CELL_PX, body_by_sigma, bone_sigma_mm, sigma_colours, strip_frames, verdict
+from tricap.core.report.overview import NOT_WANTED, WHY, body_by_sigma, bone_sigma_mm, headline, joint_words, sigma_colours, verdict
 from tricap.core.report.pages import Report, _page, limb_of
+from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
 from tricap.core.report.trails import GROUND, KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.run.record import REASONS
 from tricap.core.tracking.reasons import REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
 from tricap.core.tracking.trajectories import with_kinematics
@@ -39,7 +46,16 @@ ARM = default_shape(read_model("arm.R"))
 NASTY = "<img src=x onerror=alert(1)>"
 PROBE = """
 const seen = {errors: window.failed, width: document.documentElement.scrollWidth, inner: innerWidth}
-seen.columns = getComputedStyle(document.querySelector('.row')).gridTemplateColumns.split(' ').length
+seen.columns = getComputedStyle(document.querySelector('.row.graphs')).gridTemplateColumns.split(' ').length
+seen.keys = [...document.querySelectorAll('.cells figure')].filter(f => f.offsetHeight).length
+const stage = document.querySelector('.stage'), slider = stage.querySelector('input')
+seen.film = [stage.hidden, slider.max, slider.value, stage.querySelector('output').textContent]
+slider.value = 5; slider.dispatchEvent(new Event('input')); seen.place = document.querySelector('.strip .now').getAttribute('x')
+const strip = document.querySelector('.strip svg'), bar = strip.getBoundingClientRect()
+strip.dispatchEvent(new MouseEvent('click', {clientX: bar.left + 0.9 * bar.width})); seen.clicked = slider.value
+stage.querySelector('button').click(); seen.playing = stage.querySelector('button').textContent
+const figure = document.querySelector('.row:not(.cells) figure'), before = figure.offsetWidth
+figure.querySelector('img').click(); seen.larger = figure.offsetWidth / before
 seen.paper = getComputedStyle(document.body).backgroundColor
 const svg = document.querySelector('svg.graph'), box = svg.getBoundingClientRect(), at = x => box.left + box.width * x / 520
 const send = (kind, x) => svg.dispatchEvent(new PointerEvent(kind, {clientX: at(x), clientY: box.top + 50}))
@@ -70,22 +86,29 @@ def fitted(**changes: Any) -> BodyFit:
 
 def test_the_verdict_reports_doubt_before_anything_sounds_certain(monkeypatch: pytest.MonkeyPatch) -> None:
     record = {"stages": {"measure": {"frames": 3, "points_per_frame": 1234.0, "sigma_mm": 0.4}, "fit": {"not_done": "no clicked joints"}}}
-    assert "1,234 points a frame" in verdict(record, None, 0) and "No body was fitted: no clicked joints." in verdict(record, None, 0)
-    assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None, 0)
-    good = verdict(record, fitted(), 0)
-    assert (
-        "fitted in 3 frames. Reported" in good
-        and "largest at wrist.R with 60 mm" in good
-        and good.endswith("No frame stands out as doubtful.")
-    )
+    assert "1,234 points a frame" in verdict(record, None) and headline(record, None, 0) == "No body was fitted: no clicked joints."
+    assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None)
+    assert "no body" in headline({"stages": {"fit": {"not_done": NOT_WANTED}}}, None, 0)
+    good = verdict(record, fitted())
+    assert "fitted in 3 frames. Its joints are known to" in good and good.endswith("Least certain is the right wrist, with 60 mm.")
+    assert headline(record, fitted(), 0) == "No frame stands out as doubtful."
+    assert headline(record, fitted(), 1).startswith("Usable, but look at 1 frame: the worst is below")
+    assert headline(record, fitted(), 2).startswith("Usable, but look at 2 frames: the worst are below")
     names = ARM.skeleton.joint_names
     monkeypatch.setattr(overview, "FEW_FRAMES", 0)
-    rows = [tuple(word if name == "wrist.R" else "seen" for name in names) for word in ("seen", "inferred", "guessed")]
-    unseen = verdict(record, fitted(motion=replace(fitted().motion, known=tuple(rows))), 0)
-    assert "in 2 of them a limb is inferred or guessed" in unseen and "The right arm in 1 frames is guessed." in unseen
-    assert verdict(record, fitted(), 2).endswith("2 frames are doubtful; the worst are shown here.")
-    assert "has not converged" in verdict(record, fitted(converged=False), 0)
-    assert "contradict it in 2 frames" in verdict(record, fitted(contradicted={"forearm.R": (0, 1)}, converged=False), 1)
+    rows = [tuple(word if name == "wrist.R" else "seen" for name in names) for word in ("seen", "guessed", "guessed")]
+    unseen = fitted(motion=replace(fitted().motion, known=tuple(rows)))
+    assert "In 2 of them the images do not show a limb well" in verdict(record, unseen)
+    assert headline(record, unseen, 2) == "Usable, but some of it is guessed: the right arm in frames 1–2."
+    assert "has not converged" in headline(record, fitted(converged=False), 0)
+    contradicted = fitted(contradicted={"forearm.R": (0, 1)}, converged=False)
+    assert headline(record, contradicted, 1).startswith("The images contradict the body in 2 frames")
+    assert joint_words("crown") == "top of the head" and joint_words("neck") == "neck"
+
+
+def test_every_reason_has_a_sentence() -> None:
+    """Of the reasons that a run gives for doubtful frames."""
+    assert {*REASONS.values(), *(f"fit {status}" for status in (BRIDGED, PARTIAL, SUSPECT))} == {*WHY}
 
 
 def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
@@ -94,14 +117,51 @@ def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
     assert blue[0] > blue[2] and yellow[1] > 200 and red[2] > 200 and unknown == red
     body, camera = fitted(), scenes.three_cameras()["C"]
     assert bone_sigma_mm(body, 0).tolist() == [2.0, 60.0]
-    skin = body_skin(ARM, body.motion.values[0], SkinSettings())
-    place = camera.project(skin.vertices_m)
-    picture = body_by_sigma(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), place.mean(axis=0), 90.0)
-    assert picture.shape == (CELL_PX, CELL_PX, 3)
+    skin_at = skin_in(Path("nowhere"), body, SkinSettings())
+    assert skin_at is not None
+    skin = skin_at(body.motion.values[0])
+    part = close_up(camera, [skin.vertices_m], 300).around(skin.vertices_m)
+    picture = body_by_sigma(part.image(np.full((150, 200), 90.0, np.float32)), part.camera, skin, bone_sigma_mm(body, 0))
+    assert max(picture.shape[:2]) == 300
     redness = picture[..., 2].astype(int) - picture[..., 0]
     assert redness.min() < -10 and redness.max() > 60 and (redness == 0).mean() > 0.4
-    aside = body_by_sigma(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), np.array([900.0, -400.0]), 90.0)
-    assert aside.shape == (CELL_PX, CELL_PX, 3)
+
+
+def test_a_close_up_shows_the_same_points_larger(scenes: Any) -> None:
+    """A dot of the image lies where the part's camera projects it; windows lie within the image, also about points at its edge."""
+    camera = scenes.three_cameras()["C"]
+    xyz = np.array([0.03, -0.02, 2.1]) + 0.04 * np.random.default_rng(1).uniform(-1, 1, (50, 3))
+    view = close_up(camera, [xyz, xyz + [0.05, 0, 0]], 300)
+    part = view.around(xyz)
+    assert np.allclose(part.pixels(camera.project(xyz)), part.camera.project(xyz), atol=1e-6)
+    assert part.scale > 1.5 and max(part.camera.size_px) == 300
+    dot = np.zeros(camera.size_px[::-1], np.float32)
+    x, y = np.rint(camera.project(xyz[0])).astype(int)
+    dot[y, x] = 255
+    found = np.unravel_index(part.image(dot).argmax(), part.camera.size_px[::-1])
+    assert np.abs(np.array(found[::-1]) - part.camera.project(xyz[0])).max() < 1.5 * part.scale
+    aside = view.around(camera.points_at_depth(np.tile([1.0, 1.0], (9, 1)), 2.0))
+    assert aside.corner_px.tolist() == [0, 0] and view.around(xyz[:1]).part_px == view.part_px
+    assert close_up(camera, [xyz[:2]]).part_px == camera.size_px, "too few points"
+    other = close_up(camera, [xyz + [0, 0.08, 0], xyz], 300)
+    assert len({v.part_px for v in alike([view, other])}) == 1 and len({v.part_px for v in (view, other)}) == 2
+
+
+def test_the_recording_from_above(scenes: Any) -> None:
+    """Distances, angle and size of a pixel in the caption; the person is drawn as far above the cameras as it is in front of them."""
+    rig = scenes.three_cameras()
+    clouds = [SimpleNamespace(xyz_m=np.array([[0.02 * t, 0.0, 2.0]]) + np.zeros((4, 1))) for t in range(3)]
+    shown = arrangement(rig, 1, clouds)  # type: ignore[arg-type]
+    assert shown is not None and arrangement(rig, 1, [SimpleNamespace(xyz_m=np.zeros((0, 3)))]) is None  # type: ignore[list-item]
+    centres = [c.centre_m for c in rig.cameras]
+    apart = max(np.linalg.norm(a - b) for a in centres for b in centres)
+    depth = rig.cameras[1].to_camera(np.array([0.02, 0, 2.0]))[2]
+    assert f"{depth:.2f} m in front of camera C" in words(shown) and f"{apart:.2f} m apart" in words(shown)
+    assert f"A pixel is {1e3 * depth / rig.cameras[1].focal_px:.1f} mm" in words(shown)
+    svg = ET.fromstring(plan(shown))
+    circles = [c.attrib for c in svg.iter("{http://www.w3.org/2000/svg}circle")]
+    dots, cameras = ([float(c["cy"]) for c in circles if c["r"] == r] for r in ("1.4", "4"))
+    assert len(dots) == 4 and len(cameras) == 3 and max(dots) < min(cameras)
 
 
 def test_the_strip_of_limbs_names_runs_of_frames() -> None:
@@ -110,8 +170,10 @@ def test_the_strip_of_limbs_names_runs_of_frames() -> None:
     assert "&lt;leg&gt;" in strip and "<leg>" not in strip and limb_strip([], {}) == ""
 
 
-def test_frames_of_the_strip() -> None:
-    assert strip_frames(100, [50, 3, 7, 9]) == [0, 3, 7, 20, 40, 50, 59, 79, 99] and strip_frames(1, []) == [0]
+def test_frames_of_the_film_and_of_the_strip() -> None:
+    frames, keys = chosen_frames(100, [50, 3, 7, 9])
+    assert keys == {0, 3, 7, 20, 40, 50, 59, 79, 99} and {*frames} > keys and len(frames) <= MOST_FRAMES + len(keys)
+    assert chosen_frames(1, []) == ([0], {0})
 
 
 def test_graphs_are_grouped_by_limb() -> None:
@@ -167,7 +229,7 @@ def test_vectors_point_where_the_points_go(scenes: Any) -> None:
     )
     tracks = with_kinematics(np.arange(5), np.arange(5) / 10, xyz, np.full((5, 3), 1e-3), np.ones((5, 3), dtype=np.int8), 0)
     (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2)
-    assert "velocities of 3 tracked points" in speed and "red 0.2 m/s" in speed and "red 1 m/s²" in bend
+    assert "velocities of 3 tracked points" in speed and "longest: 0.2 m/s" in speed and "longest: 1 m/s²" in bend
     front, side = np.split(front_and_side, 2, axis=1)
     red = [(p[..., 2].astype(int) - p[..., 0] > 60) & (p[..., 1] < 120) for p in (front, side)]
     columns = [len(np.unique(np.nonzero(r)[1])) for r in red]
@@ -190,7 +252,8 @@ def page(tmp_path: Path) -> Path:
     picture = jpeg(np.full((300, 400, 3), 90, np.uint8))
     files = {f"surface_{i:04d}.png": (f"Frame {i}: {NASTY}", picture) for i in range(3)}
     path = tmp_path / "report.html"
-    path.write_text(_page(report, rows, files, [(NASTY, picture)] * 6))
+    shots = [Shot(frame=i, caption=NASTY, picture=picture, key=i != 1) for i in range(7)]
+    path.write_text(_page(report, rows, files, shots))
     return path
 
 
@@ -198,13 +261,15 @@ def test_names_are_text(tmp_path: Path) -> None:
     text = page(tmp_path).read_text()
     assert NASTY not in text and "&lt;img src=x onerror=alert(1)&gt;" in text
     assert (
-        not re.search(r'(src|href)="(?!data:)', text) and "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
+        not re.search(r'(src|href)="(?!data:|#)', text)
+        and "http://" not in text.replace("http://www.w3.org", "")
+        and "https://" not in text
     )
-    assert text.index('class="verdict"') < text.index("<figure>") < text.index("<h2>Over time") < text.index("<h2>All figures")
+    assert text.index('class="verdict"') < text.index("<figure") < text.index(">Over time</h2>") < text.index(">All figures</h2>")
 
 
 @needs_browser
-@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 4, "light"), (500, 2, "dark"), (794, 3, "paper")])
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 2, "light"), (500, 1, "dark"), (794, 2, "paper")])
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
@@ -223,10 +288,13 @@ def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, sche
     dom = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
     found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
     assert found, dom[-2000:]
-    seen = json.loads(found[1])
+    seen = json.loads(unescape(found[1]))
     assert seen["errors"] == [] and seen["width"] <= seen["inner"] and seen["columns"] == columns
     assert seen["paper"] == ("rgb(27, 29, 32)" if scheme == "dark" else "rgb(255, 255, 255)")
-    assert seen["read"] == "frame 10: 20 °" and seen["zoomed"] == ["frame 5", "10"] and seen["whole"] == "frame 0" and seen["open"] >= 6
+    assert seen["keys"] == 6 and seen["film"] == [False, "6", "1", NASTY] and seen["playing"] == "Pause"
+    assert float(seen["place"]) == pytest.approx(5.5 - 3 / 180, abs=1e-3) and seen["clicked"] == "2", "the strip has three frames"
+    assert seen["larger"] > 1.5 if width > 700 else seen["larger"] == 1
+    assert seen["read"] == "frame 10: 20 °" and seen["zoomed"] == ["frame 5", "10"] and seen["whole"] == "frame 0" and seen["open"] >= 5
 
 
 @needs_browser

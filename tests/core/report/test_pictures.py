@@ -1,6 +1,7 @@
 """Graphs and pictures of the report, also of what is empty, single or not finite."""
 
 import xml.etree.ElementTree as ET
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 
 from tricap.core.report import pictures
 from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned, ticks
+from tricap.core.report.point_pictures import paths_in_space
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 
@@ -63,11 +65,11 @@ def cloud(n: int) -> PointCloud:
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_clouds_are_drawn(scenes: Any, n: int) -> None:
     camera, c = scenes.three_cameras()["C"], cloud(n)
-    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 0.0, 1.0)
+    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 1.0, "sigma, mm")
     assert over.shape == (150, 200, 3) and over.dtype == np.uint8
     assert (np.ptp(over, axis=2) > 0).any() == (n > 0)  # colour is what is measured
     front_and_side = pictures.cloud_views(c, camera, 4)
-    assert front_and_side.shape == (pictures.PANEL_PX, 2 * pictures.PANEL_PX, 3)
+    assert front_and_side.shape == (pictures.PANEL_PX, 2 * (pictures.NARROW_PX if n == 1 else pictures.PANEL_PX), 3)
     assert front_and_side.max() > 28 if n else True
 
 
@@ -99,3 +101,15 @@ def test_png_and_grey() -> None:
 def test_the_scale_has_round_values(low: float, high: float, labels: list[str]) -> None:
     found = ticks(low, high)
     assert [text for _, text in found] == labels and all(low <= value <= high for value, _ in found)
+
+
+def test_paths_of_chosen_points_have_names(scenes: Any) -> None:
+    """In both panels, where a point was last seen; a point that never was has none."""
+    xyz = np.stack([np.linspace([-0.05, 0, 2.0], [0.05, 0, 2.0], 4), np.linspace([0, 0.05, 2.0], [0, 0.1, 2.1], 4)], axis=1)
+    tracked = SimpleNamespace(xyz_m=xyz, status=np.ones((4, 2), dtype=np.int8))
+    bare, named, nobody = (paths_in_space(names, tracked, scenes.three_cameras()["C"]) for names in (("", ""), ("tip", "é"), ("tip", "")))  # type: ignore[arg-type]
+    assert bare is not None and named is not None and nobody is not None
+    for half, other in zip(np.hsplit(named != bare, 2), np.hsplit(nobody != bare, 2)):
+        assert 20 < other.any(axis=2).sum() < half.any(axis=2).sum()
+    gone = SimpleNamespace(xyz_m=np.full_like(xyz, np.nan), status=tracked.status)
+    assert paths_in_space(("a", "b"), gone, scenes.three_cameras()["C"]) is None  # type: ignore[arg-type]

@@ -12,8 +12,9 @@ from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, Packed
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
+from tricap.core.report.body_pictures import agreement_words
 from tricap.core.report.figures import figure_rows
-from tricap.core.report.pages import _agreement_caption, check_pictured
+from tricap.core.report.pages import check_pictured
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage
 from tricap.core.report.silhouettes import body_masks, by_view, is_whole_body, outlines_of, overlap, person_mask, silhouettes_of
 
@@ -96,7 +97,7 @@ def test_an_arm_is_not_compared_with_the_whole_person(scenes: Any) -> None:
     }
     rows = figure_rows({}, [], None, None, found.fits)
     assert [r["name"] for r in rows] == ["silhouette of view C, share inside the person's outline"]
-    assert "100.0 % of it inside the person's outline" in _agreement_caption(found, "C", 0)
+    assert agreement_words(found, "C", 0).endswith("share inside the person's outline (red): 100 %") and not agreement_words(found, "L", 0)
 
 
 @pytest.mark.parametrize(("model", "whole"), [("full", True), ("upper_body", False), ("arm.R", False), ("leg.L", False)])

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tricap.core.cli.main import main
-from tricap.core.report.comparison import DEFAULT, HIGHER, LOWER, PUBLISHED, Measure, comparison_page
+from tricap.core.report.comparison import DEFAULT, HIGHER, LOWER, PUBLISHED, Measure, comparison_page, written
+from tricap.core.report.pictures import png
 from tricap.core.run.compare import NEIGHBOURS, surface_noise_m
 
 
@@ -36,7 +37,29 @@ def test_the_better_value() -> None:
 
 def test_names_are_text_in_the_page(tmp_path: Path) -> None:
     page = comparison_page("<script>kick", [Measure(name="a < b", unit="<i>", published=1.0, default=np.nan)], [tmp_path, tmp_path])
-    assert "<script>" not in page and "&lt;script&gt;kick" in page and "a &lt; b" in page and "&lt;i&gt;" in page and "–" in page
+    assert "<script>kick" not in page and "&lt;script&gt;kick" in page and "a &lt; b" in page and "&lt;i&gt;" in page and "–" in page
+
+
+def test_the_page_groups_measures_and_describes_pictures(tmp_path: Path) -> None:
+    """A measure that neither has is left out; pictures of the same name are a row, with what they show in words."""
+    for method in (PUBLISHED, DEFAULT):
+        (tmp_path / method / "report").mkdir(parents=True)
+        for name in ("body_0007_C.png", "trails_removed.png", "layers.png"):
+            (tmp_path / method / "report" / name).write_bytes(png(np.zeros((4, 4, 3), np.uint8)))
+    shared = dict(unit="mm", better=LOWER)
+    measures = [
+        Measure(name="a", group="Surface", published=2.0, default=0.00002, **shared),
+        Measure(name="b", group="Surface", published=1.0, default=1.0, **shared),
+        Measure(name="c", group="Body", published=np.nan, default=np.nan, **shared),
+    ]
+    page = comparison_page("kick", measures, [tmp_path / method for method in (PUBLISHED, DEFAULT)])
+    assert page.count(">Surface</span>") == 1 and "Body</span>" not in page and "&lt; 0.001" in page
+    assert "default: the fitted body, frame 7, view C" in page and "published: the layers of the body in its rest pose" in page
+    assert "removed by the filters" in page and page.count("<img") == 6
+
+
+def test_values_are_short() -> None:
+    assert [written(v) for v in (np.nan, 0.0, 12_345.6, 98.163, 0.25, 100.0)] == ["–", "0", "12,346", "98.2", "0.250", "100"]
 
 
 def test_both_methods_on_a_take(plane_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
