@@ -78,6 +78,42 @@ def tiny_graph(shape: Shape, *, inputs: int = 1, outputs: int = 1) -> bytes:
     return _whole(graph + b"".join(_field(12, _value(f"out{i}", shape)) for i in range(outputs)))
 
 
+def constant_maps(value: float) -> bytes:
+    """A network whose heat maps are `value` everywhere."""
+    weights = {"w": np.zeros((17, 3, 1, 1)), "value": np.array([value])}
+    nodes = [_node("Conv", ["image", "w"], "points", kernel_shape=[1, 1]), _node("Add", ["points", "value"], "maps")]
+    return _model(nodes, (1, 3, 64, 48), {"maps": (1, 17, 64, 48)}, weights)
+
+
+def external_graph(location: str, *, parts: int = 1, branch: bool = False) -> bytes:
+    """A network whose weights are in another file; they stand in another part of the model, or in a branch of its graph."""
+    weights = b"".join(_field(1, n) for n in (17, 3, 1, 1)) + _field(2, 1) + _field(8, "w")
+    weights = _field(5, weights + _field(13, _field(1, "location") + _field(2, location)) + _field(14, 1))
+    if branch:
+        weights = _field(1, _field(4, "If") + _field(5, _field(1, "then_branch") + _field(6, weights) + _field(20, 5)))
+    graph = _field(1, _node("Conv", ["image", "w"], "maps", kernel_shape=[1, 1])) + _field(2, "g")
+    graph += _field(11, _value("image", (1, 3, 64, 48))) + _field(12, _value("maps", (1, 17, 64, 48)))
+    return _whole(graph) + _field(7, weights) if parts > 1 else _whole(graph + weights)
+
+
+def greedy_graph(factor: float) -> bytes:
+    """A network that needs `factor` numbers more where the image is not black in its colours."""
+    weights = {"w": np.ones((17, 3, 1, 1)), "factor": np.array([factor]), "one": np.array([1.0]), "flat": np.array([1])}
+    nodes = [
+        _node("Conv", ["image", "w"], "points", kernel_shape=[1, 1]),
+        _node("ReduceMax", ["image"], "most", axes=[0, 1, 2, 3], keepdims=1),
+        _node("Abs", ["most"], "size"),
+        _node("Mul", ["size", "factor"], "larger"),
+        _node("Add", ["larger", "one"], "positive"),
+        _node("Cast", ["positive"], "whole", to=7),
+        _node("Reshape", ["whole", "flat"], "count"),
+        _node("Expand", ["one", "count"], "many"),
+        _node("ReduceMax", ["many"], "least", axes=[0], keepdims=1),
+        _node("Add", ["points", "least"], "maps"),
+    ]
+    return _model(nodes, (1, 3, 64, 48), {"maps": (1, 17, 64, 48)}, weights)
+
+
 def costly_graph(copies: int, layers: int) -> bytes:
     """A network of a few kilobytes that makes so many copies of its maps, and looks over them so many times."""
     weights = {"w": np.ones((17, 3, 1, 1)), "copies": np.array([copies, 17, 64, 48])}

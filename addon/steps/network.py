@@ -43,7 +43,7 @@ class FindJointsWithNetwork(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], NetworkJoints]":
         """The project with the scene's current values, and the network's file."""
-        from ...core.run.network_joints import joints_by_network, open_network
+        from ...core.run.network_joints import joints_by_file
 
         if not self.filepath:
             raise InputError("Choose the network's .onnx file.")
@@ -51,7 +51,7 @@ class FindJointsWithNetwork(JobOperator, bpy.types.Operator):
             raise InputError("Add the footage first; then the joints can be found in it.")
         network: Path = folders.absolute(self.filepath)
         folder: Path = project.chosen(context.scene, "", "")[0]
-        return lambda monitor: joints_by_network(open_take(read_take(folder)), open_network(network, monitor), monitor)
+        return lambda monitor: joints_by_file(open_take(read_take(folder)), network, monitor)
 
     def finish(self, context: bpy.types.Context, result: "NetworkJoints") -> set[str]:
         """Write them into the project as [[keypoints]]."""

@@ -6,7 +6,7 @@ import json
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..run.joints import joints_of_take, pixels_of, write_joints_as_clicks
-from ..run.network_joints import joints_by_network, open_network, write_network_joints
+from ..run.network_joints import joints_by_file, write_network_joints
 from ..take.footage import open_take
 from ..take.take import read_take
 from .arguments import overrides
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 def _by_network(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """The joints in every image, by a network; written as [[keypoints]] where that is asked for."""
     take = read_take(args.take)
-    found = joints_by_network(open_take(take), open_network(args.model, monitor), monitor)
+    found = joints_by_file(open_take(take), args.model, monitor)
     written = write_network_joints(take.folder, found) if args.write else []
     images = found.numbers.shape[1]
     counts = {view: {"points": int(n), "contradicted": int(c)} for view, n, c in zip(found.views, found.found, found.contradicted)}

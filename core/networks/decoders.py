@@ -20,7 +20,7 @@ BLAZEPOSE = (
     "right_thumb left_hip right_hip left_knee right_knee left_ankle right_ankle left_heel right_heel left_foot_index right_foot_index"
 ).split()
 OF_BLAZEPOSE = 5  # numbers of a point
-LEAST = 1e-6  # of a heat map, for its logarithm
+LEAST, MOST = 1e-6, 1e6  # of a heat map, for its logarithm
 IMAGENET = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # mean and standard deviation of RGB, 0 to 255 (as mmpose and timm use them)
 UNIT = (0.0, 0.0, 0.0), (255.0, 255.0, 255.0)
 
@@ -67,7 +67,7 @@ def _from_heat_maps(maps: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     y, x = np.divmod(best, w)
     each = np.arange(count)
     value = maps[0, each, y, x]
-    logs = np.log(np.maximum(maps[0], LEAST))
+    logs = np.log(np.clip(np.nan_to_num(maps[0], nan=LEAST), LEAST, MOST))
     fine_x = x + _peak(logs[each, y, np.maximum(x - 1, 0)], logs[each, y, x], logs[each, y, np.minimum(x + 1, w - 1)])
     fine_y = y + _peak(logs[each, np.maximum(y - 1, 0), x], logs[each, y, x], logs[each, np.minimum(y + 1, h - 1), x])
     return _points(fine_x * size_px[0] / w, fine_y * size_px[1] / h, value)
@@ -92,6 +92,7 @@ def _from_blazepose(numbers: np.ndarray, person: float) -> np.ndarray:
 
 def _points(x: np.ndarray, y: np.ndarray, confidence: np.ndarray) -> np.ndarray:
     """(K, 3), with confidence 0 where anything is no number."""
-    table = np.stack([x, y, np.clip(confidence, 0.0, 1.0)], axis=1).astype(np.float64)
+    table = np.stack([x, y, confidence], axis=1).astype(np.float64)
     table[~np.isfinite(table).all(axis=1)] = 0.0
+    table[:, 2] = np.clip(table[:, 2], 0.0, 1.0)
     return table

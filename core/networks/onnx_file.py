@@ -1,6 +1,8 @@
-"""What an ONNX file says about its input, read from its protocol buffer; OpenCV does not tell it.
+"""What an ONNX file says about its input, and whether it names other files, read from its protocol buffer; OpenCV does not tell it, and
+reads weights from any file of the system that a network names.
 
-Only four kinds of fields are looked at (onnx.proto3): ModelProto.graph, GraphProto.input and .initializer, and the dimensions of an input.
+Only a few fields are looked at (onnx.proto3): those of INSIDE, and of an input the dimensions. A field that may be there once, such as
+ModelProto.graph, may be there in several parts, which readers put together.
 """
 
 from collections.abc import Iterator
@@ -12,7 +14,17 @@ from ..foundation.errors import InputError
 ONNX_BYTES = 1 << 30
 GRAPH, INITIALIZER, INPUT = 7, 5, 11  # fields of ModelProto and GraphProto
 NAME, TYPE = 1, 2  # of ValueInfoProto
-TENSOR_NAME = 8  # of TensorProto
+TENSOR_NAME, EXTERNAL_DATA, DATA_LOCATION = 8, 13, 14  # of TensorProto
+INSIDE = {  # the messages in which there may be tensors, by their fields
+    "model": {GRAPH: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "graph": {1: "node", INITIALIZER: "tensor", 15: "sparse"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+}
+LARGEST_FIELD = (1 << 29) - 1  # number of a field
 VALUE, TEXT = 1, 2  # dim_value and dim_param of a dimension
 VARINT, BIT64, BYTES, BIT32 = 0, 1, 2, 5  # wire types
 MOST_BITS = 64
@@ -35,12 +47,15 @@ def input_shape(data: bytes, path: Path) -> tuple[int, ...]:
     """The sizes of the only input of a network, 0 where it leaves them open. `path` is named in messages.
 
     Raises:
-        InputError: the data are no ONNX file, or have several inputs.
+        InputError: the data are no ONNX file, have several inputs, or name other files.
     """
     try:
         shapes = _input_shapes(memoryview(data))
+        external = _names_files(memoryview(data))
     except ValueError as error:
         raise InputError(f"{path} is no ONNX file, or it is damaged: {error}.") from error
+    if external:
+        raise InputError(f"{path} has its weights in other files; save the network as one file, without external data.")
     if len(shapes) != 1:
         raise InputError(f"{path} is a network with {len(shapes)} inputs; give one that takes an image, such as RTMPose's.")
     return shapes[0]
@@ -52,7 +67,7 @@ def _input_shapes(data: memoryview) -> list[tuple[int, ...]]:
     if not graphs:
         raise ValueError("it has no graph")
     inputs, stored = dict[bytes, tuple[int, ...]](), set[bytes]()
-    for number, value in _fields(graphs[0]):
+    for number, value in (field for graph in graphs for field in _fields(graph)):
         if isinstance(value, int):
             continue
         if number == INITIALIZER:
@@ -61,6 +76,20 @@ def _input_shapes(data: memoryview) -> list[tuple[int, ...]]:
             name, shape = _named_shape(value)
             inputs[name] = shape
     return [shape for name, shape in inputs.items() if name not in stored]
+
+
+def _names_files(model: memoryview) -> bool:
+    """Whether any tensor of a network is in another file."""
+    waiting = [("model", model)]
+    while waiting:
+        kind, message = waiting.pop()
+        for number, value in _fields(message):
+            if kind == "tensor":
+                if number in (EXTERNAL_DATA, DATA_LOCATION) and value:
+                    return True
+            elif isinstance(value, memoryview) and (inner := INSIDE[kind].get(number)):
+                waiting.append((inner, value))
+    return False
 
 
 def _named_shape(info: memoryview) -> tuple[bytes, tuple[int, ...]]:
@@ -88,6 +117,8 @@ def _fields(data: memoryview) -> Iterator[Field]:
     while at < len(data):
         key, at = _varint(data, at)
         kind = key & 7
+        if not 0 < key >> 3 <= LARGEST_FIELD:
+            raise ValueError("a field has no number")
         if kind == VARINT:
             value, at = _varint(data, at)
             yield key >> 3, value

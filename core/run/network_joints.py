@@ -7,8 +7,6 @@ Points whose rays miss each other by more than clicks may are given up in the vi
 
 import glob
 import json
-import signal
-import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,23 +18,19 @@ from ..fitting.inputs.background import find_background
 from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import empty_clouds
 from ..fitting.inputs.take_inputs import LEAST_CONFIDENCE
-from ..foundation import bounded, store
+from ..foundation import store
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.intersection import clicks_contradict, doubtful_view, intersect_clicks
-from ..networks.onnx_file import input_shape, read_onnx
 from ..networks.pose_network import PoseNetwork
 from ..take.footage import Footage
 from ..take.writing import read_table, write_table
-from .engine import python_command
+from .network_process import open_network
 
 FOLDER, ENDING = "keypoints", ".network.json"  # in the take's folder
 SIGMA_OF_HEIGHT, LEAST_SIGMA_PX = 0.02, 2.0  # of a confident point, about the person's height: 35 mm of a person of 1.75 m
 LEAST_HEIGHT = 0.15  # of the image's, of a region that may be the person
-TRIAL = "core.cli.network_trial"  # the module that tries a network
-OVER_TIME = int(getattr(signal, "SIGXCPU", 0)) or 1 << 20  # how a trial ends that computes too long; Windows has no such limit
-LOOK_S, LONGEST_S = 0.2, 300.0  # between two looks at the trial, and its longest time
 OVERLAP = 0.7  # of two boxes, below which the network looks again
 Box = tuple[float, float, float, float]  # left, top, right, bottom
 
@@ -58,39 +52,15 @@ class NetworkJoints:
         return np.asarray((self.points[..., 2] >= LEAST_CONFIDENCE).sum(axis=(1, 2)))
 
 
-def open_network(path: Path, monitor: Monitor) -> PoseNetwork:
-    """Open a network, after another process has tried it: OpenCV crashes on some damaged files.
+def joints_by_file(footage: Footage, path: Path, monitor: Monitor) -> NetworkJoints:
+    """The joints in all images, by the network in a file.
 
     Raises:
-        InputError: it cannot be read or run, or its layout is not known.
+        InputError: see `open_network` and `joints_by_network`.
         Cancelled: the user asked to stop.
     """
-    data = read_onnx(path)
-    input_shape(data, path)
-    monitor.check()
-    command, environment = python_command(TRIAL)
-    pipe = subprocess.PIPE
-    with subprocess.Popen([*command, str(path)], env=environment, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL) as trial:
-        given: bytes | None = data
-        for _ in range(round(LONGEST_S / LOOK_S)):
-            try:
-                answer, _ = trial.communicate(given, timeout=LOOK_S)
-                break
-            except subprocess.TimeoutExpired:
-                given = None  # the rest of it is written
-            if monitor.cancelled:
-                trial.kill()
-                monitor.check()
-        else:
-            trial.kill()
-            raise InputError(f"OpenCV needs more than {LONGEST_S / 60:.0f} minutes for one run of {path}; use a smaller network.")
-    if trial.returncode == -OVER_TIME:
-        raise InputError(f"{path} computes longer than a network of its size does; use another.")
-    if trial.returncode or not answer:
-        raise InputError(f"OpenCV crashes when it opens {path}; the file is damaged, or of a kind that OpenCV does not know.")
-    if error := bounded.json_of(answer).get("error"):
-        raise InputError(error)
-    return PoseNetwork.of(data, path)
+    with open_network(path, monitor) as network:
+        return joints_by_network(footage, network, monitor)
 
 
 def joints_by_network(footage: Footage, network: PoseNetwork, monitor: Monitor) -> NetworkJoints:

@@ -60,8 +60,8 @@ def check_keys(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> 
 
 
 def is_pixel(value: Any) -> bool:
-    """Whether it is [x, y]."""
-    return isinstance(value, list) and len(value) == 2 and all(is_number(v) for v in value)
+    """Whether it is [x, y], not farther from any image than arithmetic can bear."""
+    return isinstance(value, list) and len(value) == 2 and all(is_number(v) and abs(v) <= LARGEST_PX for v in value)
 
 
 def is_number(value: Any) -> TypeGuard[float]:
@@ -126,6 +126,8 @@ def person_files(folder: Path, view: str, kind: str, picture: Path) -> tuple[str
     return f"{glob.escape(target.name)}/*{picture.suffix}" if kind == "masks" else target.name, (target, source)
 
 
+LARGEST_PX = 1e6  # of a click
+LEAST_SIGMA, LARGEST_SIGMA = 1e-4, 1e4  # px, or m in space: beyond, the weights leave the range of numbers
 KEYS = ("files", "view", "offset_frames", "sigma", "names", "axes")
 PIXELS = (".json",)  # files of keypoints in pixels
 SPACE = (".trc", ".c3d", ".csv")  # files of keypoints in space
@@ -176,6 +178,8 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
         if joint not in joints:
             raise InputError(f"A {where} has an unknown joint {shown(joint)}.{nearest_name(str(joint), tuple(joints))}")
     offset, sigma, axes = table.get("offset_frames", 0), table.get("sigma", SIGMA_PX if view else SIGMA_M), table.get("axes")
-    if not isinstance(offset, int) or not isinstance(sigma, (int, float)) or not 0 < sigma < 1e4 or not isinstance(axes, str | None):
-        raise InputError(f"The {where} with “{files}” needs a whole `offset_frames`, a positive `sigma` and a name as `axes`.")
+    fits = isinstance(sigma, (int, float)) and LEAST_SIGMA <= sigma <= LARGEST_SIGMA
+    if not isinstance(offset, int) or not fits or not isinstance(axes, str | None):
+        needs = f"a whole `offset_frames`, a positive `sigma` ({LEAST_SIGMA:g} to {LARGEST_SIGMA:g}) and a name as `axes`"
+        raise InputError(f"The {where} with “{files}” needs {needs}.")
     return KeypointSource(files=files, view=view, offset_frames=offset, sigma=float(sigma), names=names, axes=axes)

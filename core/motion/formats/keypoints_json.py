@@ -45,6 +45,7 @@ LAYOUTS = {17: COCO, 18: (*ARMS, *LEGS, *FACE), 25: (*ARMS, "MidHip", *LEGS, *FA
 WHOLE_BODY = 133  # COCO with feet, face and hands: the body's come first
 NUMBER = re.compile(r"(\d{1,12})(?:_keypoints)?$", re.IGNORECASE)  # in the name of an image's file
 MOST_DIGITS = 15
+LARGEST_PX = 1e6  # of a coordinate: beyond, it is a mistake of the detector
 Person = np.ndarray  # (K, 3) x, y, confidence
 
 
@@ -179,11 +180,13 @@ def _dicts(rows: Any, path: Path) -> list[dict[str, Any]]:
 
 
 def _numbers(values: Any, path: Path) -> Person:
-    """(K, 3) of a flat list x, y, confidence, …"""
+    """(K, 3) of a flat list x, y, confidence, …; points that are no numbers, or nowhere near an image, are not there: zeros."""
     try:
-        return np.array(values if values is not None else [], dtype=np.float64).reshape(-1, 3)
+        points = np.array(values if values is not None else [], dtype=np.float64).reshape(-1, 3)
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has keypoints that are not x, y, confidence, x, y, …; export them again.") from error
+    there = np.isfinite(points).all(axis=1) & (np.abs(points[:, :2]) <= LARGEST_PX).all(axis=1)
+    return np.where(there[:, None], points, 0.0)
 
 
 def natural_order(text: str) -> list[Any]:

@@ -52,6 +52,13 @@ def test_openpose_follows_one_person_in_the_takes_frames(tmp_path) -> None:
     assert found.sigma[knee[0]] == pytest.approx(6.0 / 0.9**0.5)
 
 
+def test_points_that_are_no_numbers_or_far_from_any_image_are_not_there(tmp_path) -> None:
+    far, nowhere = [[value, 5.0, 0.9] * 25 for value in (1e308, float("inf"))]
+    _openpose(tmp_path / "kp", [_person(0)], [far, _person(4)], [nowhere], [far[:15] + _person(8)[15:]])
+    found = read_source(_footage(tmp_path), _source(files="kp/*.json", view="C"))
+    assert set(found.frame.tolist()) == {-2, -1, 1} and np.abs(found.place).max() < 1e4
+
+
 def test_a_missing_file_shifts_no_other(tmp_path) -> None:
     _openpose(tmp_path / "kp", [_person(0)], [_person(4)], [_person(8)], [_person(12)])
     (tmp_path / "kp" / "C_001_keypoints.json").unlink()
@@ -150,6 +157,8 @@ def test_every_layout_has_the_limbs() -> None:
         (dict(files="a.trc", names={"a": "kne.R"}), "knee.R"),
         (dict(files="a.trc", sigmas=3), "sigma"),
         (dict(files="a.trc", sigma=-1), "positive"),
+        (dict(files="a.trc", sigma=1e-308), "0.0001 to 10000"),
+        (dict(files="kp/*.json", view="C", sigma=float("nan")), "0.0001 to 10000"),
     ],
 )
 def test_bad_sources_are_refused(table, sentence) -> None:

@@ -8,7 +8,7 @@ import pytest
 from tricap.core.foundation.errors import InputError
 from tricap.core.networks.pose_network import PoseNetwork
 
-from ...pose_graphs import SEEN, drawn, pose_graph, tiny_graph
+from ...pose_graphs import SEEN, constant_maps, drawn, external_graph, pose_graph, tiny_graph
 
 PICTURE, BOX = (520, 400), (196.0, 80.0, 326.0, 298.0)
 
@@ -75,6 +75,10 @@ REFUSED = {
     "huge": (lambda whole: tiny_graph((1, 3, 40000, 64)), "takes 1 × 3 × 40000 × 64"),
     "a list": (lambda whole: tiny_graph((7,)), "takes 7;"),
     "other outputs": (lambda whole: tiny_graph((1, 3, 64, 64)), "returns 1 × 3 × 64 × 64; known are heat maps"),
+    "weights in any file": (lambda whole: external_graph("/etc/passwd"), "has its weights in other files"),
+    "weights in a file, in a second part": (lambda whole: external_graph("w.bin", parts=2), "has its weights in other files"),
+    "weights in a file, in a branch": (lambda whole: external_graph("w.bin", branch=True), "has its weights in other files"),
+    "field 0": (lambda whole: whole + b"\x00\x00", "a field has no number"),
     "unknown operation": (lambda whole: whole.replace(b"Relu", b"Rolu"), "OpenCV cannot read the network"),
 }
 
@@ -85,3 +89,9 @@ def test_what_is_no_pose_network_is_refused(tmp_path: Path, case: str) -> None:
     with pytest.raises(InputError) as error:
         opened(tmp_path, made(pose_graph("heat maps", 17, (64, 64))))
     assert said in str(error.value) and "pose.onnx" in str(error.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_maps_that_are_no_numbers_find_nobody(tmp_path: Path, value: float) -> None:
+    network = opened(tmp_path, constant_maps(value))
+    assert not network.joints(np.zeros((64, 64, 3), np.float32), (0.0, 0.0, 64.0, 64.0))[:, 2].any()

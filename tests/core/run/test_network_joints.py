@@ -2,6 +2,7 @@
 
 import json
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -14,11 +15,12 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.rig import write_rig
 from tricap.core.networks.pose_network import PoseNetwork
-from tricap.core.run.network_joints import joints_by_network, open_network, without_contradictions, write_network_joints
+from tricap.core.run.network_joints import joints_by_file, joints_by_network, without_contradictions, write_network_joints
+from tricap.core.run.network_process import open_network
 from tricap.core.take.footage import Footage, open_take
 from tricap.core.take.take import read_take
 
-from ...pose_graphs import costly_graph, drawn, pose_graph
+from ...pose_graphs import costly_graph, drawn, greedy_graph, pose_graph
 from ..conftest import Scenes
 
 FRAMES, JOINTS = 6, 17
@@ -105,17 +107,17 @@ def test_nobody_is_told_and_cancelling_stops(take: Path, footage: Footage, tmp_p
     monitor.cancel()
     with pytest.raises(Cancelled):
         joints_by_network(footage, network, monitor)
-    with pytest.raises(Cancelled):
-        open_network(take / "pose.onnx", monitor)
+    with pytest.raises(Cancelled), open_network(take / "pose.onnx", monitor):
+        pass
 
 
 def test_a_network_on_which_opencv_crashes_is_refused(tmp_path: Path) -> None:
     whole = pose_graph("simcc", JOINTS, SIZE)
     (tmp_path / "pose.onnx").write_bytes(whole.replace(b"\x12\x04maps", b"\x12\x04seen", 1))  # a node's output is its own input
-    with pytest.raises(InputError, match="OpenCV crashes when it opens .*pose.onnx"):
-        open_network(tmp_path / "pose.onnx", Monitor())
-    with pytest.raises(InputError, match="Cannot read .*nothing.onnx"):
-        open_network(tmp_path / "nothing.onnx", Monitor())
+    with pytest.raises(InputError, match="OpenCV crashes when it runs .*pose.onnx"), open_network(tmp_path / "pose.onnx", Monitor()):
+        pass
+    with pytest.raises(InputError, match="Cannot read .*nothing.onnx"), open_network(tmp_path / "nothing.onnx", Monitor()):
+        pass
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
@@ -125,8 +127,19 @@ def test_a_network_on_which_opencv_crashes_is_refused(tmp_path: Path) -> None:
 )
 def test_a_small_network_that_asks_for_gigabytes_or_minutes_is_refused(tmp_path: Path, copies: int, layers: int, said: str) -> None:
     (tmp_path / "pose.onnx").write_bytes(costly_graph(copies, layers))
-    with pytest.raises(InputError, match=said):
-        open_network(tmp_path / "pose.onnx", Monitor())
+    with pytest.raises(InputError, match=said), open_network(tmp_path / "pose.onnx", Monitor()):
+        pass
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+def test_a_network_that_asks_for_gigabytes_when_it_sees_the_image_is_refused(footage: Footage, tmp_path: Path) -> None:
+    (tmp_path / "pose.onnx").write_bytes(greedy_graph(3e8))
+    with open_network(tmp_path / "pose.onnx", Monitor()) as network:
+        assert len(network.names) == 17  # the black image of the trial costs nothing
+        before = len(threading.enumerate())
+    assert len(threading.enumerate()) == before - 2
+    with pytest.raises(InputError, match="OpenCV cannot run the network: Failed to allocate"):
+        joints_by_file(footage, tmp_path / "pose.onnx", Monitor())
 
 
 def test_a_link_out_of_the_take_is_not_followed(take: Path, footage: Footage, tmp_path: Path) -> None:
