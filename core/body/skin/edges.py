@@ -2,15 +2,22 @@
 
 A relief moves both sides of a fold, as at an armpit, towards each other until they meet, and narrow quads make the fairing unstable
 there. Where quads would fold, the displacement is halved, with a smooth transition, until none does (`without_folds`), and the fairing is
-left out (`faired_outside_folds`). Elsewhere an edge is a ledge of a few millimetres, or a quad too long for the surface: its surroundings
-move half way to the means of their neighbours until no edge turns too much (`eased`), which costs the shape less than a wider fairing.
+left out (`faired_outside_folds`). A slit that is left, at the nape or in an armpit, is closed: the displacement from the skin before the
+relief, which is smooth there, becomes biharmonic about it (`without_slits`),
+
+    ‖M^(−½) C (x − x⁰)‖² → min                                                                              (1)
+
+with M, C of surface_operators at x⁰. Elsewhere an edge is a ledge of a few millimetres, or a quad too long for the surface: its
+surroundings move half way to the means of their neighbours until no edge turns too much (`eased`), which costs the shape less than a wider
+fairing. Where that turns edges more, it is left out.
 """
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .closed_skin import beyond_edges, flipped, mean_of_neighbours
+from .closed_skin import beyond_edges, flipped, mean_of_neighbours, within
+from .surface_operators import factorised, laplacian
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -25,6 +32,11 @@ EASING_RING = 40  # steps after which another ring of vertices moves
 FOLD_RINGS = 2  # about a fold in which the displacement is halved, one more after two rounds …
 UNFAIRED_RINGS = 8  # … and in which the skin is not faired
 BLURRED = 3  # rings of the transition
+SLIT = np.radians(15.0)  # an edge of a slit turns by more, and by `SLACK` more than before the relief
+SLACK = np.radians(3.0)
+SLIT_RINGS = 4  # about a slit, which are made anew …
+WIDER = 2  # … and so many more where that was not enough
+SLIT_ROUNDS = 8
 
 
 def turns(vertices: np.ndarray, faces: np.ndarray, beyond: np.ndarray) -> np.ndarray:
@@ -58,6 +70,37 @@ def faired_outside_folds(vertices: np.ndarray, faces: np.ndarray, fair: np.ndarr
     return np.asarray(fair + share[:, None] * (vertices - fair))
 
 
+def without_slits(before: np.ndarray, vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) of which those that `may` (V,) follow the ones `before` (V, 3) about slits.  (1)"""
+    beyond, near = beyond_edges(faces)[0], mean_of_neighbours(faces, len(vertices))
+    limit, allowed = np.maximum(SLIT, turns(before, faces, beyond) + SLACK), may[faces].all(axis=1)
+    found = best = vertices
+    least, moved = len(faces), np.zeros(len(vertices), dtype=bool)
+    for step in range(SLIT_ROUNDS):
+        sharp = ((turns(found, faces, beyond) > limit).any(axis=1) | flipped(found, faces)) & allowed
+        if (count := int(sharp.sum())) < least:
+            best, least = found, count
+        if not count:
+            break
+        chosen = np.isin(np.arange(len(vertices)), faces[sharp])
+        moved[within(near, chosen, SLIT_RINGS + WIDER * step)] = True
+        moved &= may
+        found = np.where(moved[:, None], before + _biharmonic(before, faces, vertices - before, moved), vertices)
+    return best
+
+
+def _biharmonic(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The displacement (V, 3) with that of the vertices `free` (V,) as smooth as can be between the others'.  (1)"""
+    from scipy import sparse
+
+    C, area = laplacian(vertices, faces)
+    rows, bend = np.flatnonzero(free), sparse.csr_matrix(sparse.diags(area**-0.5) @ C)[within(C != 0, free, 1)]
+    own, fixed = bend[:, rows], np.where(free[:, None], 0.0, displacement)
+    found = fixed.copy()
+    found[rows] = factorised(own.T @ own).solve(-(own.T @ (bend @ fixed)))
+    return found
+
+
 def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.ndarray | None = None) -> np.ndarray:
     """Vertices (V, 3): those that `may` move (V,), near edges that turn too much, moved to their neighbours' means.
 
@@ -69,6 +112,7 @@ def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.
     limit = LARGEST_TURN if earlier is None else np.maximum(LARGEST_TURN, 1.001 * turns(earlier, faces, beyond))
     if (turns(found, faces, beyond)[allowed] > LARGEST_TURN).sum() > COARSE * 4 * allowed.sum():
         return found
+    touched = np.zeros(len(vertices), dtype=bool)
     for step in range(EASING_STEPS):
         sharp = (turns(found, faces, beyond) > limit).any(axis=1) & allowed
         if not sharp.any():
@@ -76,7 +120,22 @@ def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.
         share = _around(near, faces[sharp], step // EASING_RING, blurred=2) * may
         rows = np.flatnonzero(share > 1e-3)
         found[rows] += 0.5 * share[rows, None] * (near[rows] @ found - found[rows])
-    return found
+        touched[rows] = True
+    return _where_better(vertices, found, faces, near, np.flatnonzero(touched))
+
+
+def _where_better(before: np.ndarray, after: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix", rows: np.ndarray) -> np.ndarray:
+    """The vertices `after` (V, 3) that moved, `rows`, but those `before` in pieces whose edges turn more by then."""
+    from scipy.sparse import csgraph
+
+    if not len(rows):
+        return after
+    beyond, piece = beyond_edges(faces)[0], np.full(len(before), -1)
+    piece[rows] = csgraph.connected_components(near[rows][:, rows], directed=False)[1]
+    own = piece[faces].max(axis=1)
+    worse = [np.maximum(turns(v, faces, beyond) - LARGEST_TURN, 0.0).sum(axis=1) for v in (before, after)]
+    was, now = (np.bincount(own[own >= 0], w[own >= 0], piece.max() + 1) for w in worse)
+    return np.where(((piece >= 0) & (now > was)[piece])[:, None], before, after)
 
 
 def _around(near: "sparse.csr_matrix", chosen: np.ndarray, rings: int, blurred: int = BLURRED) -> np.ndarray:

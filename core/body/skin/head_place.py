@@ -7,8 +7,8 @@ degree w to which they are the head's, smoothed over the neck:
 
     x' = x + w (Q S (x − c) + c + t − x) ,   Σ ρ( m·(X − x')/σ ) + pᵀ Σ⁻¹ p → min                              (1)
 
-with Σ = diag(σ_p²), and more for a common scale. X and m are a point and its normal in the head's axes, x' the nearest of those vertices
-whose normals are alike, renewed in every step, ρ Tukey's biweight. A head on which few points were measured stays where it is.
+with Σ = diag(σ_p²), and more for a common scale; X, m a point and its normal in the head's axes, x' the nearest of those vertices whose
+normals are alike, renewed in every step. ρ is Tukey's biweight. A head on which few points were measured stays where it is.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from ..shape import BodyShape
 from ..skeleton import bone_frames
 from .closed_skin import OneSkin
 from .ends import HEAD
-from .extremities import has_end
+from .extremities import NECK, has_end
 from .relief import LEAST_COSINE, Nearby, SurfacePoints
 from .surface_operators import vertex_normals
 
@@ -37,6 +37,7 @@ MOST_FRAMES = 24  # evenly
 CANDIDATES = 4  # nearest vertices of a point
 STEPS = 15
 OWN = 0.5  # weight of the head in vertices that are compared
+NECKS = 0.2  # of the neck's weight with which it goes along
 
 
 def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> OneSkin:
@@ -51,7 +52,10 @@ def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[Surface
     points, normals = _in_head(shape, b, frames, local[own > OWN])
     if len(points) < FEWEST:
         return skin
-    share = Nearby(skin.vertices_m, skin.faces).mean(own[:, None])  # wider than the weights, or the throat would fold
+    necks = skin.weights[:, [name == NECK for name in names]].sum(axis=1)
+    share = Nearby(skin.vertices_m, skin.faces).mean(
+        (own + NECKS * necks)[:, None]
+    )  # wider than the weights, or throat and nape would fold
     movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R[b], share=share, own=own > OWN)
     p = _registered(movable, points, normals)
     return replace(skin, vertices_m=head[b] + movable.at(p) @ R[b].T)

@@ -70,7 +70,7 @@ def with_limb_borders(shape: BodyShape, vertices: np.ndarray, part: np.ndarray, 
 
 
 CHEST = "chest"
-COLLAR = 0.42  # how far below the neck's joint the collar is in the middle of the body, in lengths of the chest's bone …
+COLLAR = 0.2  # how far below the neck's joint the collar is in the middle of the body, in lengths of the chest's bone …
 FALL = 0.35  # … and how much lower it is farther ahead
 JAWS = 0.97  # weight of the head in vertices that are entirely the head's
 ROUNDED = 0.3  # of |·| in (2)

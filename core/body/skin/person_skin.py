@@ -6,6 +6,7 @@
 The mesh of a whole body has DETAIL² quads for each quad of its cage; the skins of the frames have the quads of the cage.
 """
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from ...foundation.progress import Monitor
 from ..shape import BodyShape
 from .closed_skin import OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
-from .edges import eased, faired_outside_folds, without_folds
+from .edges import eased, faired_outside_folds, without_folds, without_slits
 from .ends import HEAD
 from .fairing import OF_RELIEF, anatomical, faired
 from .fingers import FINGER_BONE, RIGID_BONE
@@ -30,6 +31,9 @@ from .welding import cut
 REST = "rest.npz"  # in the folder skin/
 VERSION = 1
 MOST_PIECES = 64
+NAPE, JAW = 0.3, 0.95  # weights of the head in vertices where it begins, and where nearly all is the head's
+DIGIT = 0.05  # … of fingers or toes, hands or feet in vertices that are theirs
+HAND_OR_FOOT = re.compile(rf"(hand|foot)\.[RL]|{FINGER_BONE.pattern}")
 END_M = 0.06  # within this distance of its ends a limb keeps its shape
 
 
@@ -48,9 +52,19 @@ def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
 
 def _plain(skin: OneSkin, shape: BodyShape) -> np.ndarray:
     """(V,) bool: the vertices that belong neither to the head nor to fingers or toes, whose shapes have edges."""
-    names = [bone.name for bone in shape.skeleton.bones]
-    head, digits = [name == HEAD for name in names], [FINGER_BONE.fullmatch(name) is not None for name in names]
-    return np.asarray((skin.weights[:, head].sum(axis=1) < 0.3) & (skin.weights[:, digits].sum(axis=1) < 0.05))
+    head, digits = _share(skin, shape, re.compile(HEAD)), _share(skin, shape, FINGER_BONE)
+    return np.asarray((head < NAPE) & (digits < DIGIT))
+
+
+def _may_slit(skin: OneSkin, shape: BodyShape) -> np.ndarray:
+    """(V,) bool: the vertices where the relief may open slits: not those of face, hands and feet, whose hollows are their own."""
+    head, ends = _share(skin, shape, re.compile(HEAD)), _share(skin, shape, HAND_OR_FOOT)
+    return np.asarray((head < JAW) & (ends < DIGIT))
+
+
+def _share(skin: OneSkin, shape: BodyShape, bones: re.Pattern[str]) -> np.ndarray:
+    """(V,) the weights of the bones of these names."""
+    return np.asarray(skin.weights[:, [bones.fullmatch(bone.name) is not None for bone in shape.skeleton.bones]].sum(axis=1))
 
 
 def _kept(skin: OneSkin, shape: BodyShape) -> np.ndarray:
@@ -74,6 +88,7 @@ def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mi
     rough, every = skin.vertices_m + displacement[:, None] * along, np.ones(len(along), dtype=bool)
     fair = faired_outside_folds(rough, skin.faces, faired(rough, skin.faces, _kept(skin, shape), OF_RELIEF))
     moved = eased(unflipped(fair, skin.faces, every), skin.faces, _plain(skin, shape), straight.vertices_m)
+    moved = without_slits(straight.vertices_m, moved, skin.faces, _may_slit(skin, shape))
     moved = unflipped(moved, skin.faces, every)
     displacement = np.einsum("vk,vk->v", moved - skin.vertices_m, along)
     return replace(skin, vertices_m=moved, relief_m=displacement, sigma_m=relief.sigma_m)

@@ -6,8 +6,8 @@ import numpy as np
 
 from tests.core.body.whole_body import whole_body
 from tricap.core.body.shape import BodyShape
-from tricap.core.body.skin.closed_skin import OneSkin, beyond_edges, flipped, one_skin
-from tricap.core.body.skin.edges import LARGEST_TURN, eased, faired_outside_folds, turns, without_folds
+from tricap.core.body.skin.closed_skin import OneSkin, beyond_edges, flipped, mean_of_neighbours, one_skin
+from tricap.core.body.skin.edges import LARGEST_TURN, SLIT, _where_better, eased, faired_outside_folds, turns, without_folds, without_slits
 from tricap.core.body.skin.limb_weights import with_neck
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.surface_operators import vertex_normals
@@ -60,6 +60,29 @@ def test_a_displacement_that_folds_the_skin_is_smaller_there_only() -> None:
     assert not flipped(skin.vertices_m + found[:, None] * along, skin.faces).any()
     far = np.linalg.norm(skin.vertices_m - skin.vertices_m[len(along) // 2], axis=1) > 0.4
     assert np.array_equal(found[far], displacement[far])
+
+
+def test_a_slit_is_closed_and_the_rest_stays() -> None:
+    _, skin = body()
+    along, beyond = vertex_normals(skin.vertices_m, skin.faces), beyond_edges(skin.faces)[0]
+    far = np.linalg.norm(skin.vertices_m - skin.vertices_m[len(along) // 2], axis=1)
+    torn = skin.vertices_m + np.where(far < 0.01, -0.03, 0.0)[:, None] * along
+    every, before = np.ones(len(along), dtype=bool), turns(skin.vertices_m, skin.faces, beyond)
+    found = without_slits(skin.vertices_m, torn, skin.faces, every)
+    opened = [(turns(v, skin.faces, beyond) > np.maximum(SLIT, before + np.radians(3.0))).any() for v in (torn, found)]
+    assert opened == [True, False]
+    assert np.array_equal(found[far > 0.3], torn[far > 0.3])
+    assert np.abs(found - skin.vertices_m).max() < 0.001
+    assert np.array_equal(without_slits(skin.vertices_m, torn, skin.faces, ~every), torn)
+
+
+def test_an_easing_that_turns_edges_more_is_left_out() -> None:
+    vertices, faces, thigh = ledge()
+    near, rows = mean_of_neighbours(faces, len(vertices)), np.flatnonzero(thigh)
+    rough = vertices.copy()
+    rough[rows] += 0.01 * np.random.default_rng(0).standard_normal((len(rows), 3))
+    assert np.array_equal(_where_better(vertices, rough, faces, near, rows), vertices)
+    assert np.array_equal(_where_better(rough, vertices, faces, near, rows), vertices)
 
 
 def test_a_fairing_that_folds_the_skin_is_left_out_there() -> None:
