@@ -19,6 +19,7 @@ class Cause(StrEnum):
     FILES_MISSING = "files missing"
     FOREIGN_RIG = "foreign rig"
     FRAMES_MISSING = "frames missing"
+    FRAME_RATE = "frame rate"
     FROZEN_VIEW = "frozen view"
     IDENTICAL_VIEWS = "identical views"
     INPUT = "input"

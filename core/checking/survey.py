@@ -1,7 +1,7 @@
 """One pass over the reduced footage: how much moves in each frame, how bright it is, and which frames repeat."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,11 @@ WHITE_SHARE = 0.03  # of the pixels
 BRIGHT_PERCENTILE = 98  # of the grey values: the brightest parts
 BEGINNING = 50  # frames of a movie
 UNEVEN = 0.6  # frames; time stamps are rounded
+STAMPED = 5000  # frames of a movie whose time stamps are compared
+GAP = 1.5  # usual steps of the time stamps: images are missing in a larger one
+FEW_GAPS = 0.05  # share of the steps; with more of them, the rate varies
+SAME_RATE = 0.02  # relative difference of two frame rates
+TIMESTAMPS = "Give the view the `timestamps` of its images in take.toml, or convert the movie to a constant frame rate."
 REPEATED = 0.2  # of a view's usual motion energy, which includes the noise
 FEWEST_FRAMES = 4  # for a usual motion energy
 SELDOM = 0.02  # share of repeated frames, and one at least, that harms nothing: there the motion pauses for a frame
@@ -99,21 +104,47 @@ def picture_findings(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
 
 
 def rate_findings(footage: Footage) -> list[Finding]:
-    """Movies whose frame rate varies among the frames read so far, or in the first second or two."""
-    findings = []
+    """Movies whose frame rate varies among the frames read so far, or in the first second or two; that lack images in mid-clip; or whose
+    rate is not the take's."""
+    findings, rates = [], dict[str, tuple[float, float]]()
     for k, (view, sequence) in enumerate(zip(footage.take.views, footage.sequences)):
         movie = sequence.behind if isinstance(sequence, Recent) else sequence
         if not isinstance(movie, Movie) or view.timestamps is not None:
             continue
-        beginning = min(BEGINNING, footage.number(k, footage.frames.stop - 1) + 1)
-        if movie.shown < beginning:
-            movie.read(beginning - 1)
-        uneven = movie.unevenness
-        if uneven > UNEVEN:
+        used = footage.number(k, footage.frames.stop - 1) + 1
+        if movie.shown < min(BEGINNING, used):
+            movie.read(min(BEGINNING, used) - 1)
+        step_ms, gaps = _gaps(movie.stamps_ms(min(max(used, BEGINNING), STAMPED)), used)
+        uneven, few = movie.unevenness, len(gaps) <= FEW_GAPS * used
+        if uneven > UNEVEN and not (gaps and few):
             sentence = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
-            advice = "Give the view the `timestamps` of its images in take.toml, or convert the movie to a constant frame rate."
-            findings.append(wrong(Cause.VARIABLE_FRAME_RATE, sentence, advice, uneven_frames=uneven))
-    return findings
+            findings.append(wrong(Cause.VARIABLE_FRAME_RATE, sentence, TIMESTAMPS, uneven_frames=uneven))
+        elif gaps:
+            lost = f"{len(gaps)} places, the first of them" if len(gaps) > 1 else "one place,"
+            sentence = f"The time stamps of view {view.name} show that images are missing in {lost} before its image {gaps[0]}."
+            findings.append(wrong(Cause.FRAMES_MISSING, sentence, TIMESTAMPS, first_image=gaps[0], places=len(gaps)))
+        if step_ms > 0:
+            rates[view.name] = 1000.0 / step_ms, view.fps or footage.take.fps / footage.take.field_layout.per_image
+    return findings + _other_rates(rates)
+
+
+def _gaps(stamps_ms: np.ndarray, used: int) -> tuple[float, list[int]]:
+    """The usual step of time stamps (n,), 0 if not known, and the numbers below `used` of the images before which some are missing."""
+    steps = np.diff(stamps_ms)
+    if len(steps) < FEWEST_FRAMES - 1:
+        return 0.0, []
+    usual = steps < GAP * np.median(steps)
+    return float(steps[usual].mean()), (1 + np.flatnonzero(~usual[: used - 1])).tolist()
+
+
+def _other_rates(rates: Mapping[str, tuple[float, float]]) -> list[Finding]:
+    """Of views whose movies state another rate than take.toml has for them."""
+    other = {name: (own, given) for name, (own, given) in rates.items() if abs(own / given - 1) > SAME_RATE}
+    if not other:
+        return []
+    stated = ", ".join(f"{own:.3g} images per second in view {name} ({given:.3g} in take.toml)" for name, (own, given) in other.items())
+    advice = "Correct `fps` in take.toml, or add it to the [[views]] that differ; a film in slow motion may state what it likes."
+    return [doubtful(Cause.FRAME_RATE, f"The movies state {stated}: times and speeds may be wrong.", advice)]
 
 
 def gap_findings(footage: Footage) -> list[Finding]:

@@ -23,10 +23,11 @@ H264 = ("avc1", "avc3", "h264", "H264", "x264", "X264", "\x1b\0\0\0")
 HEVC = ("hvc1", "hev1", "hevc", "HEVC", "H265", "\x24\0\0\0")
 FIELDS = ("dvsd", "dvcp", "dvh1", "mpg2", "mp2v", "\x02\0\0\0")  # DV and MPEG-2, which mark nearly all pictures as interlaced
 MOST_HEADER = 4096  # bytes of a sequence header that are looked at
+REORDERED = 16  # packets by which a codec may store a picture before those that are shown earlier
 
 
-class PacketSizes:
-    """The sizes of a movie's pictures, by frame, and whether they may be marked as interlaced."""
+class Packets:
+    """The sizes of a movie's pictures, by frame, whether they may be marked as interlaced, and when they are shown."""
 
     def __init__(self, path: Path) -> None:
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
@@ -36,6 +37,7 @@ class PacketSizes:
         self._fields = name in FIELDS
         self._next = 0
         self._changes: list[tuple[int, Size]] = []
+        self._stamps_ms: list[float] = []
 
     @property
     def may_be_interlaced(self) -> bool:
@@ -44,18 +46,28 @@ class PacketSizes:
 
     def at(self, frame: int) -> tuple[int, Size] | None:
         """The frame from which on the pictures have the size of those of `frame`, and that size; None if it is not known."""
+        self._read(frame)
+        return next((change for change in reversed(self._changes) if change[0] <= frame), None)
+
+    def stamps_ms(self, count: int) -> np.ndarray:
+        """When the first pictures (count,) are shown, increasing; none where the movie has no such times."""
+        self._read(count - 1 + REORDERED)
+        stamps = np.sort(self._stamps_ms)[:count]
+        return stamps if (np.diff(stamps) > 0).all() else np.zeros(0)
+
+    def _read(self, frame: int) -> None:
         while self._next <= frame and self._capture.isOpened():
             more, packet = self._capture.read()
             if not more:
                 self._capture.release()
                 break
+            self._stamps_ms.append(float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
             found = self._header_in(np.asarray(packet).tobytes())
             if found is not None:
                 self._fields |= found[1]
                 if not self._changes or found[0] != self._changes[-1][1]:
                     self._changes.append((self._next, found[0]))
             self._next += 1
-        return next((change for change in reversed(self._changes) if change[0] <= frame), None)
 
 
 def _reader(code: str) -> Callable[[bytes], Header | None]:

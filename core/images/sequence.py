@@ -15,7 +15,7 @@ import numpy as np
 from ..foundation import bounded
 from ..foundation.errors import InputError
 from .headers import claimed_size
-from .packets import PacketSizes
+from .packets import Packets
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
@@ -156,15 +156,15 @@ class Movie:
         self._capture = _capture(path)
         self._next, self._last = 0, np.zeros(0)
         self._shown_ms: dict[int, float] = {}
-        self._sizes = PacketSizes(path)
+        self._packets = Packets(path)
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
             raise InputError(NO_MOVIE.format(path=path))
         w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         _refuse_size((w, h), path)
         self._count = count
-        self._sizes.at(0)
-        if self._sizes.may_be_interlaced and count > 1:
+        self._packets.at(0)
+        if self._packets.may_be_interlaced and count > 1:
             self.read(0), self.read(1)
 
     @property
@@ -206,14 +206,14 @@ class Movie:
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
         self._refuse_change(index)
-        if self._sizes.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
+        if self._packets.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
             raise InputError(MARKED.format(path=self._path, name=shlex.quote(self._path.name)))
         self._last = image
         return grey(image)
 
     def _refuse_change(self, index: int) -> None:
         """The decoder would scale such pictures, so that they fit no calibration."""
-        first, now = self._sizes.at(0), self._sizes.at(index)
+        first, now = self._packets.at(0), self._packets.at(index)
         if first is not None and now is not None and now[1] != first[1]:
             raise InputError(
                 f"From frame {now[0]} on, the pictures of {self._path} have {now[1][0]}×{now[1][1]} pixels instead of "
@@ -229,6 +229,13 @@ class Movie:
     def shown(self) -> int:
         """Number of frames decoded so far, whose time stamps are known."""
         return len(self._shown_ms)
+
+    def stamps_ms(self, count: int) -> np.ndarray:
+        """When the first frames (at most `count`) are shown, increasing: of those decoded so far, or of more that are not decoded."""
+        decoded = np.array([self._shown_ms[n] for n in range(count) if n in self._shown_ms])
+        if len(decoded) < min(count, self._count):  # which shows also pictures that the decoder skips, for they are damaged
+            return self._packets.stamps_ms(count)
+        return decoded if (np.diff(decoded) > 0).all() else np.zeros(0)
 
     @property
     def unevenness(self) -> float:

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.checking.findings import Checked
-from tricap.core.checking.survey import Survey, picture_findings
+from tricap.core.checking.findings import Cause, Checked
+from tricap.core.checking.survey import Survey, picture_findings, rate_findings
 from tricap.core.checking.take_check import check_clouds, check_take, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.cli import main
@@ -345,6 +345,55 @@ def test_every_run_tells_a_variable_frame_rate(arm_recording: Record, tmp_path: 
     assert not [s for s in check_clouds(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "frame rate" in s]
     (take / "r.mp4").write_bytes(with_a_pause((take / "r.mp4").read_bytes()))
     assert [s for s in check_clouds(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "View R has a variable frame rate" in s]
+
+
+def with_movies(take: Path, rates: dict[str, float]) -> None:
+    """Motion JPEG instead of the images of some views, at these rates."""
+    said = (take / "take.toml").read_text(encoding="utf-8")
+    for view, rate in rates.items():
+        shots = [cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR) for path in pictures(take, view)]
+        writer = cv2.VideoWriter(str(take / f"{view}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), rate, shots[0].shape[1::-1])
+        for shot in shots:
+            writer.write(shot)
+        writer.release()
+        said = said.replace(f'images = "{view}/*.png"', f'movie = "{view}.avi"')
+    (take / "take.toml").write_text(said, encoding="utf-8")
+
+
+def lose_image(path: Path, number: int) -> None:
+    """Leave the data of an image of an AVI file empty, as recorders do with images that they lost; the file keeps its length."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"00dc", data.index(b"movi"))
+    for _ in range(number):
+        at = data.index(b"00dc", at + 8 + int.from_bytes(data[at + 4 : at + 8], "little"))
+    length = int.from_bytes(data[at + 4 : at + 8], "little")
+    data[at : at + 16] = b"00dc" + bytes(4) + b"JUNK" + (length + length % 2 - 8).to_bytes(4, "little")
+    entry = data.index(b"idx1") + 8 + 16 * number
+    data[entry + 12 : entry + 16] = bytes(4)
+    path.write_bytes(data)
+
+
+def test_an_image_that_a_recorder_lost_is_told_by_check_and_by_every_run(arm_recording: Record, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    with_movies(take, {"R": 25.0})
+    footage = open_take(read_take(take))
+    assert not [f for f in rate_findings(footage) if f.cause in (Cause.FRAMES_MISSING, Cause.VARIABLE_FRAME_RATE)]
+    lose_image(take / "R.avi", 3)
+    last = footage.sequences[-1].count - 1
+    (take / "take.toml").write_text(f"frames = [0, {last}]\n" + (take / "take.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    (said,) = [s for s in check_clouds(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "time stamps" in s]
+    assert "of view R show that images are missing in one place, before its image 3" in said
+
+
+def test_movies_of_another_rate_than_the_takes_are_told(arm_recording: Record, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    rate = read_take(take).fps
+    with_movies(take, {"L": rate, "R": 2 * rate})
+    (found,) = rate_findings(open_take(read_take(take)))
+    assert found.cause is Cause.FRAME_RATE and "per second in view R" in found.sentence and "view L" not in found.sentence
+    said = (take / "take.toml").read_text(encoding="utf-8").replace('"R.avi"', f'"R.avi"\nfps = {2 * rate}')
+    (take / "take.toml").write_text(said, encoding="utf-8")
+    assert not rate_findings(open_take(read_take(take)))
 
 
 def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.images import packets
-from tricap.core.images.packets import PacketSizes, _reader
+from tricap.core.images.packets import Packets, _reader
 from tricap.core.images.sequence import Movie, open_sequence
 
 # sequence headers as x264 and x265 write them, after the units' start: codec, header, width, height, whether pictures may be interlaced
@@ -69,7 +69,7 @@ def test_a_movie_whose_pictures_change_their_size_is_refused_from_there_on(tmp_p
             movie.read(frame)
     for frame in (2, 0, 5, 1):
         assert movie.read(frame).shape == (48, 64)
-    sizes = PacketSizes(path)
+    sizes = Packets(path)
     assert [sizes.at(i) for i in (5, 4, 2, 900)] == [(5, (64, 48)), (3, (128, 96)), (0, (64, 48)), (5, (64, 48))]
 
 
