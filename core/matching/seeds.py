@@ -24,9 +24,7 @@ from .least_squares import MatchingSettings
 from .patches import patch_offsets
 from .views import TemplateGrid, Views
 
-NEAREST_BASES = (
-    0.8  # nearest depth of the sweep, in lengths of the longest base of the views that are matched, where nothing else limits it
-)
+NEAREST_BASES = 0.8  # nearest depth of the sweep over the longest base of the views that are matched, where nothing else limits it
 FARTHEST_BASES = 40.0  # farthest depth
 SWEEP_STEP_PX = 1.0  # px of the fastest search image from sample to sample
 MIN_SCORE = 0.80  # of (1)

@@ -14,7 +14,9 @@ from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..body.shape import write_body
 from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
+from ..body.skin.facing import facing_ahead
 from ..body.skin.fingers import shape_for_skin
+from ..body.skin.head_place import face_turn
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
 from ..body.skin.posed import Poser
@@ -289,33 +291,41 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
         contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
         given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
         body = fit_from(given, start, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"], "fit_again"))
-    run.body = body
-    _write_body(run, body, monitor)
+    run.body = body = _write_body(run, body, monitor)
     run.results.remove("cache/fit", "cache/fit_again")
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again
 
 
-def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
+def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
+    """Write skin, joints, motion and shape; gives the body with a head that looks where the face does."""
     try:
-        _write_skins(run, body, monitor)
+        body = _write_skins(run, body, monitor)
     except InputError as no_skin:
         run.warn(f"No skin was made: {no_skin}")
         run.results.remove("skin")
     write_joints(run.results.path("joints.csv"), body.motion)
     write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
     write_body(run.results.path("body.toml"), body.shape)
+    return body
 
 
-def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
-    """The person's skin in the rest pose, with relief, and its cage in every frame's pose. Raises InputError for a body that has none."""
+def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
+    """The person's skin in the rest pose, with relief, and its cage in every frame's pose; gives the body that it belongs to.
+
+    Raises:
+        InputError: the body has no skin.
+    """
     settings: SkinSettings = run.settings["skin"]
     person = shape_for_skin(body.shape, settings)
     skin = rest_skin(person, settings)
     points = _surface_points(run, body) if settings.relief else []
     if points:
+        turn = face_turn(skin, person, points)
         skin = with_relief(skin, person, points, settings.mirror, monitor)
+        if turn is not None:
+            body, skin, person = facing_ahead(body, skin, person, turn)
     write_skin(run.results.path("skin", REST), skin)
     if settings.texture_px:
         _write_texture(run, body, TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)
@@ -326,6 +336,7 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
         cast = body_skin(person, values, settings) if settings.exact else None
         mesh = (cast.vertices_m, cast.faces) if cast else (poser.posed(vertices, values), faces)
         write_mesh(run.results.path("skin", f"{frame:04d}.ply"), *mesh)
+    return body
 
 
 def _write_texture(run: Run, body: BodyFit, baker: TextureBaker, monitor: Monitor) -> None:

@@ -29,6 +29,8 @@ from .surface_operators import vertex_normals
 MEAN = np.array([0.0, 0.0, 0.0, -0.38, 0.0, 0.0, 0.0, 0.0, 0.0])  # of p: the fitted head is an ellipsoid along the line from chin to crown
 PRIOR = np.array([0.01, 0.03, 0.015, 0.1, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p of t [m], Rodrigues vector of Q, ln S: to the side, up, ahead
 SIZE = 0.1  # … and what the three ln S have in common
+LEVEL = np.array([0.165, 0.0, 0.0])  # the anatomical head looks up by so much [rad], where a level one is registered to it
+MOST_TURN = 0.45  # rad, of Q to the side
 FARTHEST_M = 0.03  # of a point from the skin
 SIGMA_M = 0.003  # σ: what a face differs from the anatomical one
 EACH_FOR = 100.0  # as many points count as one: their errors are alike
@@ -42,23 +44,49 @@ NECKS = 0.2  # of the neck's weight with which it goes along
 
 def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> OneSkin:
     """The skin of the rest pose with its head registered to the points of all frames.  (1)"""
+    placed = _placed(skin, shape, frames)
+    if placed is None:
+        return skin
+    R, head = _head_frame(shape)
+    return replace(skin, vertices_m=head + placed[0].at(placed[1]) @ R.T)
+
+
+def face_turn(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> np.ndarray | None:
+    """Where the face looks: the rotation from the axes of the head's bone to those of the face, as a Rodrigues vector (3,).
+
+    None if there are too few points, or if they would have to turn the head by more than a fit is wrong: then they do not show the face.
+    """
+    placed = _placed(skin, shape, frames)
+    turn = np.zeros(3) if placed is None else placed[1][3:6]
+    if not turn.any() or abs(turn[1]) > MOST_TURN:
+        return None
+    return vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(LEVEL))
+
+
+def _head_frame(shape: BodyShape) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (3, 3) and head (3,) of the head's bone in the rest pose."""
+    b = [bone.name for bone in shape.skeleton.bones].index(HEAD)
+    R, head = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
+    return R[b], head[b]
+
+
+def _placed(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> "tuple[_Movable, np.ndarray] | None":
+    """The vertices of the head, and p (9,) of (1); None where nothing can be registered."""
     names = [bone.name for bone in shape.skeleton.bones]
     b = names.index(HEAD) if HEAD in names else -1
     if b < 0 or not has_end(shape, b) or not frames:
-        return skin
-    R, head = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
+        return None
+    R, head = _head_frame(shape)
     own = skin.weights[:, b]
-    local = (skin.vertices_m - head[b]) @ R[b]
+    local = (skin.vertices_m - head) @ R
     points, normals = _in_head(shape, b, frames, local[own > OWN])
     if len(points) < FEWEST:
-        return skin
+        return None
     necks = skin.weights[:, [name == NECK for name in names]].sum(axis=1)
-    share = Nearby(skin.vertices_m, skin.faces).mean(
-        (own + NECKS * necks)[:, None]
-    )  # wider than the weights, or throat and nape would fold
-    movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R[b], share=share, own=own > OWN)
-    p = _registered(movable, points, normals)
-    return replace(skin, vertices_m=head[b] + movable.at(p) @ R[b].T)
+    weight = own + NECKS * necks
+    share = Nearby(skin.vertices_m, skin.faces).mean(weight[:, None])  # wider than the weights, or throat and nape would fold
+    movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R, share=share, own=own > OWN)
+    return movable, _registered(movable, points, normals)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

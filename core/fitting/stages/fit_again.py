@@ -42,6 +42,7 @@ from .sigma_parts import CLOTH_M, known
 REACH_S = 0.4  # from a click to the last frame that it may change
 HELD = 2  # frames at each end: accelerations tie three
 HELD_SIGMA = 1e-5  # rad, m
+UNMEASURED = float(np.radians(1.0))  # sigma of the prior of a DOF that the fit keeps at its mean
 PULLED = 0.1  # of the sigma of a click that was changed since the earlier fit
 STAGE = "fit around the clicks"
 
@@ -107,6 +108,7 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
     clicked, places = clicks_by_frame(given, names, settings)
     body = ShapeParameters(earlier.shape, settings.weights)
     middle = body.state(before[len(before) // 2], body.vector()).joints_m.mean(axis=0)
+    priors = [_about_earlier(p, before) for p in dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), middle)]
     fit = context_of(
         given,
         settings,
@@ -116,7 +118,7 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         located=np.zeros(len(names), dtype=bool),
         clicks=Clicks(observations=(), xyz_m=np.full((len(names), 3), np.nan)),
         click=own.start + len(own) // 2,
-        priors=dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), middle),
+        priors=priors,
         clicked=clicked,
         places=places,
         tracks=JointTracks(given, names),
@@ -135,6 +137,13 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         feet=standing(fit, before, body.vector(), given.time_s),
     )
     return whole.stretch(range(len(before)), before, body.vector())
+
+
+def _about_earlier(prior: Observation, before: np.ndarray) -> Observation:
+    """The prior with the earlier values (T, D) of what the fit does not measure: the face has told it (`skin.facing`)."""
+    if not isinstance(prior, PosePrior):
+        return prior
+    return replace(prior, mean=np.where(prior.sigma < UNMEASURED, before.mean(axis=0), prior.mean))
 
 
 def _obeying(part: Recording, joints: Collection[str]) -> Recording:

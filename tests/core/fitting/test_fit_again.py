@@ -9,8 +9,9 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.inputs.fit_input import FitInput
+from tricap.core.fitting.observations import JointLimits, PosePrior
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.stages.fit_again import HELD, EarlierFit, around, fit_again, limbs_with, with_held
+from tricap.core.fitting.stages.fit_again import HELD, EarlierFit, _about_earlier, around, fit_again, limbs_with, with_held
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.foundation.progress import Cancelled, Monitor
 
@@ -67,3 +68,11 @@ def test_a_lost_limb_follows_its_click(make_scene) -> None:
     stopped.cancel()
     with pytest.raises(Cancelled):
         fit_again(given, earlier, rows, ["wrist.R"], FitSettings(), stopped)
+
+
+def test_what_the_fit_does_not_measure_stays_as_it_was() -> None:
+    before = np.array([[0.10, 0.5], [0.12, 0.7]])
+    prior = PosePrior(mean=np.zeros(2), sigma=np.radians([0.1, 20.0]))
+    np.testing.assert_allclose(_about_earlier(prior, before).mean, [0.11, 0.0])
+    limits = JointLimits(low=np.zeros(2), high=np.ones(2), sigma=1.0)
+    assert _about_earlier(limits, before) is limits

@@ -1,0 +1,128 @@
+"""The zero of the head's angles: nothing moves in the frames, and the bone has the face's axes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import FITTED, SEEN, BodyFit, BodyMotion
+from tricap.core.body.shape import BodyShape, default_shape
+from tricap.core.body.skeleton import bone_frames, joint_positions
+from tricap.core.body.skin.closed_skin import OneSkin
+from tricap.core.body.skin.facing import SIGMA, facing_ahead
+from tricap.core.body.skin.fingers import shape_for_skin
+from tricap.core.body.skin.head_place import LEVEL, MOST_TURN, face_turn
+from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.person_skin import rest_skin
+from tricap.core.body.skin.posed import Poser
+from tricap.core.body.skin.relief import SurfacePoints
+from tricap.core.body.skin.surface_operators import vertex_normals
+from tricap.core.geometry.rotation import rotation_from_vector, vector_from_rotation
+
+TURN = np.radians([-15.0, 9.0, 4.0])
+
+
+def _fit(model: str, frames: int = 3) -> BodyFit:
+    shape, rng = default_shape(read_model(model)), np.random.default_rng(0)
+    skeleton, names = shape.skeleton, shape.skeleton.joint_names
+    values = rng.normal(0, 0.3, (frames, len(skeleton.dofs)))
+    joints = joint_positions(skeleton, shape.lengths_m, values)
+    known = np.zeros((frames, len(names)))
+    motion = BodyMotion(
+        frames=np.arange(frames),
+        time_s=np.arange(frames) / 25,
+        dof_names=skeleton.dof_names,
+        values=values,
+        covariance=np.zeros((frames, values.shape[1], values.shape[1])),
+        joint_names=names,
+        joints_m=np.stack([joints[name] for name in names], axis=1),
+        joint_sigma_m=known,
+        joint_frame_sigma_m=known,
+        known=((SEEN,) * len(names),) * frames,
+        status=(FITTED,) * frames,
+        sigma0=np.ones(frames),
+    )
+    return BodyFit(shape=shape, motion=motion, iterations=1, converged=True, points=known, outline_m=np.zeros(0))
+
+
+def _skin_of_one_quad(shape: BodyShape, bone: str) -> OneSkin:
+    names = tuple(b.name for b in shape.skeleton.bones)
+    weights = np.tile(np.array(names) == bone, (4, 1)).astype(float)
+    at = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))[1][names.index(bone)]
+    corners = at + 0.1 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    return OneSkin(
+        vertices_m=corners, faces=np.arange(4)[None], uv=np.zeros((1, 4, 2)), weights=weights, part=np.zeros(4), bone_names=names
+    )
+
+
+def _balls_m(shape: BodyShape, values: np.ndarray) -> np.ndarray:
+    R, head = bone_frames(shape.skeleton, shape.lengths_m, values)
+    b = shape.metaballs.bone_index
+    return np.einsum("tmij,mj->tmi", R[:, b], shape.metaballs.centres_m(shape.lengths_m)) + head[:, b]
+
+
+def test_the_bone_turns_and_nothing_moves() -> None:
+    body = _fit("full")
+    shape = body.shape
+    skin = _skin_of_one_quad(shape, "head")
+    moved, ahead, carrying = facing_ahead(body, skin, shape, TURN)
+    head = [bone.name for bone in shape.skeleton.bones].index("head")
+    before, after = (bone_frames(shape.skeleton, shape.lengths_m, m.motion.values)[0] for m in (body, moved))
+    np.testing.assert_allclose(after[:, head], before[:, head] @ rotation_from_vector(TURN), atol=1e-12)
+    np.testing.assert_array_equal(np.delete(after, head, axis=1), np.delete(before, head, axis=1))
+    np.testing.assert_allclose(_balls_m(moved.shape, moved.motion.values), _balls_m(shape, body.motion.values), atol=1e-12)
+    assert np.abs(ahead.vertices_m - skin.vertices_m).max() > 0.01  # the rest pose looks elsewhere
+    for old, new in zip(body.motion.values, moved.motion.values):
+        np.testing.assert_allclose(
+            Poser(carrying, ahead.weights).posed(ahead.vertices_m, new), Poser(shape, skin.weights).posed(skin.vertices_m, old), atol=1e-12
+        )
+    others = [name != "crown" for name in body.motion.joint_names]
+    np.testing.assert_array_equal(moved.motion.joints_m[:, others], body.motion.joints_m[:, others])
+    crown = joint_positions(shape.skeleton, shape.lengths_m, moved.motion.values)["crown"]
+    np.testing.assert_allclose(moved.motion.joints_m[:, body.motion.joint_names.index("crown")], crown, atol=1e-12)
+    assert np.isclose(moved.motion.sigma, SIGMA).any(axis=0).sum() == 3
+
+
+def test_a_body_without_a_head_stays() -> None:
+    body = _fit("arm.R")
+    skin = _skin_of_one_quad(body.shape, "forearm.R")
+    assert facing_ahead(body, skin, body.shape, TURN) == (body, skin, body.shape)
+
+
+@pytest.fixture(scope="module")
+def person() -> tuple[BodyShape, OneSkin]:
+    settings = SkinSettings()
+    shape = shape_for_skin(default_shape(read_model("full")), settings)
+    return shape, rest_skin(shape, settings)
+
+
+def _points(shape: BodyShape, skin: OneSkin, turn: np.ndarray) -> list[SurfacePoints]:
+    """The front of the head's vertices, turned about their middle."""
+    b, Q = skin.bone_names.index("head"), rotation_from_vector(turn)
+    R = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))[0][b]
+    own = skin.weights[:, b] > 0.9
+    x, n = skin.vertices_m[own] @ R, vertex_normals(skin.vertices_m, skin.faces)[own] @ R
+    middle = x.mean(axis=0)
+    x, n = (x - middle) @ Q.T + middle, n @ Q.T
+    seen = n[:, 2] > -0.3
+    one = SurfacePoints(
+        motion=np.zeros(len(shape.skeleton.dofs)), xyz_m=x[seen] @ R.T, normals=n[seen] @ R.T, sigma_m=np.full(seen.sum(), 1e-3)
+    )
+    return [one] * 24
+
+
+def test_a_face_tells_where_the_head_looks(person) -> None:
+    shape, skin = person
+    turn = np.radians([-24.0, 12.0, 3.0])
+    expected = vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(LEVEL))
+    np.testing.assert_allclose(np.degrees(face_turn(skin, shape, _points(shape, skin, turn))), np.degrees(expected), atol=2.0)
+
+
+def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
+    shape, skin = person
+    assert face_turn(skin, shape, []) is None
+    few = [replace(p, xyz_m=p.xyz_m[:5], normals=p.normals[:5], sigma_m=p.sigma_m[:5]) for p in _points(shape, skin, TURN)]
+    assert face_turn(skin, shape, few) is None
+    aside = np.array([-0.4, 1.3 * MOST_TURN, 0.0])  # further than a fit is wrong
+    assert face_turn(skin, shape, _points(shape, skin, aside)) is None
