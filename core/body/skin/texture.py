@@ -34,7 +34,8 @@ from .surface_operators import factorised, laplacian, vertex_normals
 
 TEXTURE, MASK = "texture.png", "texture_mask.png"  # in the folder skin/
 LEAST_COSINE = 0.3  # between normal and ray
-KEPT = 8  # colours of a texel
+KEPT = 24  # colours of a texel, …
+LEAST_KEPT, LARGE_PX = 8, 2048  # … fewer in a texture that is wider than this, whose table would be too large
 ROBUST_GREY = 40.0  # distance from the average at which a colour's weight is halved
 REWEIGHTINGS = 4
 SIGMA_M = 0.004  # σ_0 of (1)
@@ -83,8 +84,9 @@ class TextureBaker:
         self._rows, self._cage = cage(skin)
         self.texel, self._corners, self._shares = _texels(skin, size_px)
         n = len(self.texel)
-        self._weight = np.zeros((n, KEPT), dtype=np.float32)
-        self._colour = np.zeros((n, KEPT), dtype=np.uint32)  # see `_packed`
+        self._kept = int(np.clip(KEPT * (LARGE_PX / size_px) ** 2, LEAST_KEPT, KEPT))
+        self._weight = np.zeros((n, self._kept), dtype=np.float32)
+        self._colour = np.zeros((n, self._kept), dtype=np.uint32)  # see `_packed`
         sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
         self._trust = 1 / (1 + (self._at(sigma) / SIGMA_M) ** 2)
         self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
@@ -145,7 +147,7 @@ class TextureBaker:
         rows, rgb, weight = rows[better], rgb[better], weight[better]
         own = self._weight[rows]
         place = (own[:, :-1] >= weight[:, None]).sum(axis=1)  # of the new colours; those after it move on
-        slots, every = np.arange(KEPT), np.arange(len(rows))
+        slots, every = np.arange(self._kept), np.arange(len(rows))
         order = slots - (slots > place[:, None])
         for table, kept, new in (
             (self._weight, own, weight),
