@@ -61,6 +61,13 @@ def sentence(limb: str, frames: Sequence[int], row: Sequence[str]) -> str:
     return f"{limb}: {', '.join(parts)}"
 
 
+def frame_list(frames: Sequence[int], most: int | None = None) -> str:
+    """Frames in words, at most so many spans of them: “3, 7–9”."""
+    spans = runs(frames, [str(frame - k) for k, frame in enumerate(frames)])  # the same for successive frames
+    words = [f"{a}" if a == b else f"{a}–{b}" for a, b, _ in spans[:most]]
+    return ", ".join(words) + (" …" if most is not None and len(spans) > most else "")
+
+
 def guessed_frames(frames: Sequence[int], row: Sequence[str]) -> tuple[int, ...]:
     """The frames in which a limb is guessed."""
     return tuple(int(frame) for frame, word in zip(frames, row) if word == GUESSED)

@@ -15,7 +15,6 @@ variance (of a first adjustment in which these shifts are free). Where σ_c is l
 is returned as it was matched.
 """
 
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import TypeVar
 
@@ -132,7 +131,7 @@ def _object_space(field: MatchedField, views: Views, settings: MatchingSettings,
     """The field by pieces of surface; None where the calibration contradicts the images."""
     around = surface_about(field, field.cell, views)
     theta = around.coefficients[:, : 6 if settings.neighbours else 3]
-    visible = _visible(field, views.search)
+    visible = field.matched_in(views.search)
     prior = neighbours_prior(theta, px_per_inverse_metre(views), around.scatter, RADIUS_CELLS * field.grid.spacing_px)
     wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER_SIGMA0 * settings.max_sigma0)
     starts = SurfaceStarts(
@@ -187,11 +186,6 @@ def _agrees(field: MatchedField, found: SurfacePatch, views: Views, patch_px: in
     depth = base.to_camera(field.xyz_m)[:, 2]
     allowed = SAME_PLACE / (1 + found.sigma_px / UNSURE_PX) * patch_px * depth / base.focal_px
     return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(allowed, SAME_PLACE_M)
-
-
-def _visible(field: MatchedField, search: Sequence[int]) -> np.ndarray:
-    """(N, S) which search views matched the points."""
-    return np.ascontiguousarray(np.isfinite(field.xy).all(axis=2)[:, search])
 
 
 def _without_unlike(visible: np.ndarray, found: Found, smallest: float, required: int) -> tuple[np.ndarray, np.ndarray]:
@@ -316,7 +310,7 @@ def _epipolar(field: MatchedField, views: Views, settings: MatchingSettings, mon
     lines = [Epipolar(base, views.cameras[k], rows, xy).centre(theta) for k in search]
     centre, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
     xyz_m = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0])
-    visible = _visible(field, views.search)
+    visible = field.matched_in(views.search)
     starts = MultiImageStarts(xy=xy, centre=centre, shape=shape, xyz_m=xyz_m, visible=visible)
 
     def match(which: np.ndarray, starts: MultiImageStarts, sigma_c: float) -> MultiImageMatches:

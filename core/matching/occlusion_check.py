@@ -43,7 +43,7 @@ def fails_occlusion_check(field: MatchedField, views: Views, settings: MatchingS
     starts = SurfaceStarts(
         xy=field.xy[:, views.reference],
         theta=_planes(field, views),
-        visible=np.ascontiguousarray(np.isfinite(field.xy).all(axis=2)[:, views.search]),
+        visible=field.matched_in(views.search),
     )
     sigma_m = np.sqrt(np.trace(field.covariance_m2, axis1=1, axis2=2))
     u_m = depth_uncertainty(views, starts, sigma_m, settings, px_per_inverse_metre=px_per_inverse_metre(views))

@@ -111,10 +111,9 @@ class MatchedField:
     rig_sigma_px: float = 0.0  # the calibration's own error, as the constraint found it
     weak_texture: bool = False  # the patches' sigmas are large, as the constraint found
 
-    @property
-    def complete(self) -> np.ndarray:
-        """(N,) which points are matched in all views."""
-        return np.isfinite(self.xy).all(axis=(1, 2))
+    def matched_in(self, views: Sequence[int]) -> np.ndarray:
+        """(N, S) in which of some views the points are matched."""
+        return np.ascontiguousarray(np.isfinite(self.xy).all(axis=2)[:, views])
 
     def select(self, rows: np.ndarray) -> "MatchedField":
         """The field with only these rows (a mask or indices)."""

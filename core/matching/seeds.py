@@ -97,7 +97,7 @@ def sweep_seeds(
         xy = xy[((xy >= within_px[0]) & (xy <= within_px[1])).all(axis=1)]
     xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
-    near, far = depth_range_m or _default_range([views.base, *(views.cameras[k] for k in views.search)])
+    near, far = depth_range_m or _default_range(views)
     inverse = _inverse_depths(views, near, far)
 
     def work(part: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +118,7 @@ def sweep_ray(views: Views, xy: np.ndarray, settings: MatchingSettings, depth_ra
     at = _textured(views, settings, np.asarray(xy, dtype=np.float64)[None])
     if not len(at):
         return None
-    inverse = _inverse_depths(views, *(depth_range_m or _default_range([views.base, *(views.cameras[k] for k in views.search)])))
+    inverse = _inverse_depths(views, *(depth_range_m or _default_range(views)))
     depth, good = _best_depths(_sweep_correlations(views, settings, at, inverse), inverse, len(views.search))
     return float(depth[0]) if good[0] else None
 
@@ -147,8 +147,8 @@ def _textured(views: Views, settings: MatchingSettings, xy: np.ndarray) -> np.nd
     return xy[patch.std(axis=1) > max(MIN_CONTRAST, CONTRAST_OVER_NOISE * image.noise)]
 
 
-def _default_range(cameras: Sequence[Camera]) -> tuple[float, float]:
-    centres = np.stack([c.centre_m for c in cameras])
+def _default_range(views: Views) -> tuple[float, float]:
+    centres = np.stack([views.cameras[k].centre_m for k in (views.reference, *views.search)])
     base = max(float(np.linalg.norm(a - b)) for a in centres for b in centres)
     return NEAREST_BASES * base, FARTHEST_BASES * base
 

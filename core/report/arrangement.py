@@ -14,7 +14,7 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig
 from ..surface.cloud import PointCloud
-from .drawing import length_words
+from .drawing import LONGEST, length_words, round_length
 
 WIDTH, HEIGHT, MARGIN = 520, 340, 34
 MOST_POINTS = 600  # of the person
@@ -104,9 +104,7 @@ def _edges(camera: Camera, far_m: float) -> np.ndarray:
 
 
 def _scale_and_axes(px_per_m: float) -> str:
-    most = 0.3 * WIDTH / px_per_m
-    power = 10.0 ** np.floor(np.log10(most))
-    bar = next(m * power for m in (5.0, 2.0, 1.0) if m * power <= most * (1 + 1e-9))
+    bar = round_length(LONGEST * WIDTH / px_per_m)
     left, y, right, arm = 12, HEIGHT - 12, WIDTH - 50, 26
     line = '<line x1="{}" y1="{}" x2="{:.1f}" y2="{:.1f}" stroke="currentColor" stroke-width="{}"/>'
     return (

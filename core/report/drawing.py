@@ -32,13 +32,17 @@ def add_scale(picture: np.ndarray, px_per_m: float, note: str = "", size: float 
     if not np.isfinite(px_per_m) or px_per_m <= 0:
         return
     (height, width), k = picture.shape[:2], size or size_of(picture)
-    most_m = LONGEST * width / px_per_m
-    power = 10.0 ** np.floor(np.log10(most_m))
-    bar_m = next(m * power for m in (5.0, 2.0, 1.0) if m * power <= most_m * (1 + 1e-9))
+    bar_m = round_length(LONGEST * width / px_per_m)
     left, y = round(MARGIN_PX * k), height - round(14 * k)
     for colour, thick in ((SHADOW, 4), (WHITE, 2)):
         cv2.line(picture, (left, y), (left + round(bar_m * px_per_m), y), colour, round(thick * k))
     small_text(picture, length_words(bar_m) + (f" {note}" if note else ""), (left, y - round(7 * k)), size=k)
+
+
+def round_length(most_m: float) -> float:
+    """The largest length that is 1, 2 or 5 times a power of ten [m] and no longer than another."""
+    power = 10.0 ** np.floor(np.log10(most_m))
+    return float(next(m * power for m in (5.0, 2.0, 1.0) if m * power <= most_m * (1 + 1e-9)))
 
 
 def length_words(metres: float) -> str:

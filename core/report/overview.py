@@ -1,11 +1,11 @@
 """The first screen of a report: a verdict in plain words, and the body over the footage coloured by the sigmas of its joints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..body.limb_words import FEW_FRAMES, MOST_SPANS, SIDES, guessed_frames, limb_words
+from ..body.limb_words import FEW_FRAMES, MOST_SPANS, SIDES, frame_list, guessed_frames, limb_words
 from ..body.motion import BRIDGED, GUESSED, SEEN, SUSPECT, BodyFit
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
@@ -48,7 +48,7 @@ def headline(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> 
     frames, limbs = body.motion.frames.tolist(), limb_words(body.motion.joint_names, body.motion.known)
     guessed = [limb for limb, row in limbs.items() if row.count(GUESSED) > FEW_FRAMES]
     if guessed:
-        which = "; ".join(f"the {limb} in {_spans(guessed_frames(frames, limbs[limb]))}" for limb in guessed)
+        which = "; ".join(f"the {limb} in frames {frame_list(guessed_frames(frames, limbs[limb]), MOST_SPANS)}" for limb in guessed)
         return f"Usable, but some of it is guessed: {which}."
     if doubtful:
         return f"Usable, but look at {_frames(doubtful)}: the worst {'is' if doubtful == 1 else 'are'} below, with the reason."
@@ -82,18 +82,6 @@ def joint_words(joint: str) -> str:
 
 def _frames(count: int) -> str:
     return f"{count} frame" if count == 1 else f"{count} frames"
-
-
-def _spans(frames: Sequence[int]) -> str:
-    """Frames as "frames 3, 5–9"."""
-    spans = list[tuple[int, int]]()
-    for frame in frames:
-        if spans and spans[-1][1] == frame - 1:
-            spans[-1] = (spans[-1][0], frame)
-        else:
-            spans.append((frame, frame))
-    words = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in spans[:MOST_SPANS])
-    return f"frame{'' if len(frames) == 1 else 's'} {words}{' …' if len(spans) > MOST_SPANS else ''}"
 
 
 def _of_surface(stages: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..body.limb_words import frame_list
 from ..body.motion import BodyMotion
 from ..body.shape import BodyShape, read_body
 from ..body.skin.fingers import shape_for_skin
@@ -36,7 +37,7 @@ from ..take.footage import Footage, open_take
 from ..take.take import FrameClicks, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import read_trajectories
-from .record import FrameTable, frame_list, read_frame_table, write_frame_table
+from .record import FrameTable, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import stage_keys
 

@@ -16,7 +16,7 @@ from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
 from ..body.skin.facing import facing_ahead
 from ..body.skin.fingers import shape_for_skin
-from ..body.skin.head_place import face_turn
+from ..body.skin.head_place import registered_head
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
 from ..body.skin.posed import Poser
@@ -322,10 +322,10 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
     skin = rest_skin(person, settings)
     points = _surface_points(run, body) if settings.relief else []
     if points:
-        turn = face_turn(skin, person, points)
-        skin = with_relief(skin, person, points, settings.mirror, monitor)
-        if turn is not None:
-            body, skin, person = facing_ahead(body, skin, person, turn)
+        place = registered_head(skin, person, points)
+        skin = with_relief(skin, person, points, place, settings.mirror, monitor)
+        if place is not None and place.face_turn is not None:
+            body, skin, person = facing_ahead(body, skin, person, place.face_turn)
     write_skin(run.results.path("skin", REST), skin)
     if settings.texture_px:
         _write_texture(run, body, TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)

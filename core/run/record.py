@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..body.limb_words import FEW_FRAMES, counts, guessed_frames, limb_words
+from ..body.limb_words import FEW_FRAMES, counts, frame_list, guessed_frames, limb_words
 from ..body.motion import FITTED, PARTIAL, SEEN, BodyFit
 from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded, store
@@ -157,17 +157,6 @@ def limb_name(bone: str) -> str:
     """A limb in words, by its first bone: "upper_arm.R" -> "right arm"."""
     part, _, side = bone.partition(".")
     return " ".join([{"L": "left", "R": "right"}.get(side, ""), LIMBS.get(part, part.replace("_", " "))]).strip()
-
-
-def frame_list(frames: Sequence[int]) -> str:
-    """Frames in words: “3, 7–9”."""
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][-1] + 1:
-            runs[-1].append(frame)
-        else:
-            runs.append([frame])
-    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
 COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")

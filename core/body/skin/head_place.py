@@ -42,41 +42,38 @@ OWN = 0.5  # weight of the head in vertices that are compared
 NECKS = 0.2  # of the neck's weight with which it goes along
 
 
-def with_head_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> OneSkin:
-    """The skin of the rest pose with its head registered to the points of all frames.  (1)"""
-    placed = _placed(skin, shape, frames)
-    if placed is None:
-        return skin
-    R, head = _head_frame(shape)
-    return replace(skin, vertices_m=head + placed[0].at(placed[1]) @ R.T)
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HeadPlace:
+    """Where the head of a skin was registered."""
+
+    head: "_Movable"
+    p: np.ndarray  # (9,) of (1)
+    R: np.ndarray  # (3, 3) axes of its bone in the rest pose
+    head_m: np.ndarray  # (3,) where its bone begins there
+
+    def moved(self, skin: OneSkin) -> OneSkin:
+        """The skin of the rest pose with its head there."""
+        return replace(skin, vertices_m=self.head_m + self.head.at(self.p) @ self.R.T)
+
+    @property
+    def face_turn(self) -> np.ndarray | None:
+        """Where the face looks: the rotation from the axes of the head's bone to those of the face, as a Rodrigues vector (3,).
+
+        None if the head would be turned by more than a fit is wrong: then the points do not show the face.
+        """
+        if abs(self.p[4]) > MOST_TURN:
+            return None
+        return vector_from_rotation(rotation_from_vector(self.p[3:6]) @ rotation_from_vector(LEVEL))
 
 
-def face_turn(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> np.ndarray | None:
-    """Where the face looks: the rotation from the axes of the head's bone to those of the face, as a Rodrigues vector (3,).
-
-    None if there are too few points, or if they would have to turn the head by more than a fit is wrong: then they do not show the face.
-    """
-    placed = _placed(skin, shape, frames)
-    turn = np.zeros(3) if placed is None else placed[1][3:6]
-    if not turn.any() or abs(turn[1]) > MOST_TURN:
-        return None
-    return vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(LEVEL))
-
-
-def _head_frame(shape: BodyShape) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3, 3) and head (3,) of the head's bone in the rest pose."""
-    b = [bone.name for bone in shape.skeleton.bones].index(HEAD)
-    R, head = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
-    return R[b], head[b]
-
-
-def _placed(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> "tuple[_Movable, np.ndarray] | None":
-    """The vertices of the head, and p (9,) of (1); None where nothing can be registered."""
+def registered_head(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> HeadPlace | None:
+    """Register the head of a skin in the rest pose to the points of all frames (1); None without a head, or with too few points."""
     names = [bone.name for bone in shape.skeleton.bones]
     b = names.index(HEAD) if HEAD in names else -1
     if b < 0 or not has_end(shape, b) or not frames:
         return None
-    R, head = _head_frame(shape)
+    axes, heads = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
+    R, head = axes[b], heads[b]
     own = skin.weights[:, b]
     local = (skin.vertices_m - head) @ R
     points, normals = _in_head(shape, b, frames, local[own > OWN])
@@ -86,7 +83,8 @@ def _placed(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) ->
     weight = own + NECKS * necks
     share = Nearby(skin.vertices_m, skin.faces).mean(weight[:, None])  # wider than the weights, or throat and nape would fold
     movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R, share=share, own=own > OWN)
-    return movable, _registered(movable, points, normals)
+    p = _registered(movable, points, normals)
+    return None if p is None else HeadPlace(head=movable, p=p, R=R, head_m=head)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -140,8 +138,8 @@ def _derivatives(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray
     return np.concatenate([shift, -cross_matrix(scaled @ Q.T), Q * scaled[:, None]], axis=2)
 
 
-def _registered(skin: _Movable, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """p (9,) of (1)."""
+def _registered(skin: _Movable, points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
+    """p (9,) of (1); None if too few points find a vertex."""
     from scipy.spatial import cKDTree
 
     p, rows = MEAN, np.arange(len(points))
@@ -156,7 +154,7 @@ def _registered(skin: _Movable, points: np.ndarray, normals: np.ndarray) -> np.n
         found = near[rows, best]
         good = np.flatnonzero(np.isfinite(distance[rows, best]) & (cosine[rows, best] > LEAST_COSINE) & skin.own[found])
         if len(good) < FEWEST:
-            return np.zeros(len(PRIOR))
+            return None
         n, i = normals[good], found[good]
         r = np.einsum("nk,nk->n", n, points[good] - at[i])
         J = skin.share[i] * np.einsum("nk,nkp->np", n, _derivatives(skin.x[i], skin.middle, p))

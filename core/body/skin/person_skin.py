@@ -22,7 +22,7 @@ from .edges import eased, faired_outside_folds, without_folds, without_slits
 from .ends import HEAD
 from .fairing import OF_RELIEF, anatomical, faired
 from .fingers import FINGER_BONE, RIGID_BONE
-from .head_place import with_head_in_place
+from .head_place import HeadPlace
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
 from .relief import SurfacePoints, directions, measured_relief
@@ -76,13 +76,15 @@ def _kept(skin: OneSkin, shape: BodyShape) -> np.ndarray:
     return kept
 
 
-def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mirror: bool, monitor: Monitor) -> OneSkin:
-    """The skin displaced by what the points of all frames show, without flipped quads.
+def with_relief(
+    skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], place: HeadPlace | None, mirror: bool, monitor: Monitor
+) -> OneSkin:
+    """The skin displaced by what the points of all frames show, with its head in its `place`, without flipped quads.
 
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    straight, skin = skin, with_head_in_place(skin, shape, frames)
+    straight, skin = skin, skin if place is None else place.moved(skin)
     relief, along = measured_relief(skin, shape, frames, mirror, monitor, straight), directions(skin, shape)
     displacement = without_folds(skin.vertices_m, skin.faces, relief.displacement_m, along)
     rough, every = skin.vertices_m + displacement[:, None] * along, np.ones(len(along), dtype=bool)

@@ -12,7 +12,7 @@ from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.closed_skin import OneSkin
 from tricap.core.body.skin.facing import SIGMA, facing_ahead
 from tricap.core.body.skin.fingers import shape_for_skin
-from tricap.core.body.skin.head_place import LEVEL, MOST_TURN, face_turn
+from tricap.core.body.skin.head_place import LEVEL, MOST_TURN, registered_head
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import rest_skin
 from tricap.core.body.skin.posed import Poser
@@ -116,13 +116,15 @@ def test_a_face_tells_where_the_head_looks(person) -> None:
     shape, skin = person
     turn = np.radians([-24.0, 12.0, 3.0])
     expected = vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(LEVEL))
-    np.testing.assert_allclose(np.degrees(face_turn(skin, shape, _points(shape, skin, turn))), np.degrees(expected), atol=2.0)
+    np.testing.assert_allclose(
+        np.degrees(registered_head(skin, shape, _points(shape, skin, turn)).face_turn), np.degrees(expected), atol=2.0
+    )
 
 
 def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
     shape, skin = person
-    assert face_turn(skin, shape, []) is None
+    assert registered_head(skin, shape, []) is None
     few = [replace(p, xyz_m=p.xyz_m[:5], normals=p.normals[:5], sigma_m=p.sigma_m[:5]) for p in _points(shape, skin, TURN)]
-    assert face_turn(skin, shape, few) is None
+    assert registered_head(skin, shape, few) is None
     aside = np.array([-0.4, 1.3 * MOST_TURN, 0.0])  # further than a fit is wrong
-    assert face_turn(skin, shape, _points(shape, skin, aside)) is None
+    assert registered_head(skin, shape, _points(shape, skin, aside)).face_turn is None

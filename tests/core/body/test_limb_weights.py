@@ -11,7 +11,7 @@ from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.closed_skin import OneSkin, one_skin
 from tricap.core.body.skin.fingers import shape_for_skin
-from tricap.core.body.skin.head_place import FEWEST, with_head_in_place
+from tricap.core.body.skin.head_place import FEWEST, registered_head
 from tricap.core.body.skin.limb_weights import with_limb_borders
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.relief import SurfacePoints
@@ -78,7 +78,7 @@ def seen_head(higher_m: float, ahead_m: float) -> tuple[SurfacePoints, np.ndarra
 def test_the_head_moves_to_the_measured_face() -> None:
     shape, skin = person()
     seen, head = seen_head(HIGHER_M, AHEAD_M)
-    found = with_head_in_place(skin, shape, [seen] * 3)
+    found = registered_head(skin, shape, [seen] * 3).moved(skin)
     R, _ = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
     b = list(skin.bone_names).index("head")
     moved = np.median((found.vertices_m - skin.vertices_m)[head] @ R[b], axis=0)
@@ -91,5 +91,5 @@ def test_a_head_with_few_points_stays() -> None:
     shape, skin = person()
     seen, _ = seen_head(HIGHER_M, AHEAD_M)
     few = replace(seen, **{name: getattr(seen, name)[: FEWEST - 1] for name in ("xyz_m", "normals", "sigma_m")})
-    assert with_head_in_place(skin, shape, [few]) is skin
-    assert with_head_in_place(skin, shape, []) is skin
+    assert registered_head(skin, shape, [few]) is None
+    assert registered_head(skin, shape, []) is None

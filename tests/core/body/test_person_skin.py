@@ -13,6 +13,7 @@ from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.closed_skin import OneSkin, flipped, mean_of_neighbours
 from tricap.core.body.skin.contour_skin import body_skin
 from tricap.core.body.skin.fairing import faired
+from tricap.core.body.skin.head_place import registered_head
 from tricap.core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from tricap.core.body.skin.person_skin import REST, cage, read_skin, resampled, rest_skin, with_relief, write_skin
 from tricap.core.body.skin.posed import Poser
@@ -122,7 +123,7 @@ def test_relief_is_found_where_it_was_measured_with_its_sigma() -> None:
     front = vertex_normals(skin.vertices_m, skin.faces)[:, 1] < 0
     true = np.where(forearm, 0.004, 0.0)
     true = resmoothed(true, skin)
-    found = with_relief(skin, shape, measured(shape, skin, true, 0.0005, front), False, Monitor())
+    found = with_relief(skin, shape, measured(shape, skin, true, 0.0005, front), None, False, Monitor())
     assert found.relief_m is not None and found.sigma_m is not None
     error, seen = found.relief_m - true, front & (found.sigma_m < 0.002) & (np.abs(true - 0.002) < 0.003)
     assert seen.sum() > 50 and np.median(np.abs(error[seen])) < 0.0004 and np.abs(error[seen]).max() < 0.003
@@ -142,7 +143,7 @@ def resmoothed(values: np.ndarray, skin: OneSkin) -> np.ndarray:
 def test_nothing_measured_is_no_relief() -> None:
     shape, skin = arm()
     far = SurfacePoints(motion=poses(shape, 1)[0], xyz_m=np.full((4, 3), 9.0), normals=np.tile([0.0, -1, 0], (4, 1)), sigma_m=np.ones(4))
-    found = with_relief(skin, shape, [far], False, Monitor())
+    found = with_relief(skin, shape, [far], None, False, Monitor())
     assert found.relief_m is not None and np.abs(found.relief_m).max() < 2e-5  # what the fairing moves
 
 
@@ -200,7 +201,9 @@ def test_the_other_side_is_used_on_request() -> None:
     normals = vertex_normals(skin.vertices_m, skin.faces)[left]
     points = SurfacePoints(motion=rest, xyz_m=skin.vertices_m[left] + 0.008 * normals, normals=normals, sigma_m=np.full(left.sum(), 5e-4))
     thigh = skin.weights[:, list(skin.bone_names).index("thigh.R")] > 0.9
-    plain, mirrored = (with_relief(skin, shape, [points] * 4, mirror, Monitor()) for mirror in (False, True))
+    plain, mirrored = (
+        with_relief(skin, shape, [points] * 4, registered_head(skin, shape, [points] * 4), mirror, Monitor()) for mirror in (False, True)
+    )
     assert plain.relief_m is not None and mirrored.relief_m is not None and mirrored.sigma_m is not None
     assert abs(np.median(plain.relief_m[thigh])) < 0.002 and np.median(mirrored.relief_m[thigh]) == pytest.approx(0.008, abs=0.001)
     assert np.median(mirrored.sigma_m[thigh]) > 0.001

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.body.limb_words import FEW_FRAMES
-from tricap.core.run.record import fit_warnings, frame_list, limb_name
+from tricap.core.body.limb_words import FEW_FRAMES, frame_list
+from tricap.core.run.record import fit_warnings, limb_name
 
 
 def _body(contradicted: dict[str, tuple[int, ...]], known: tuple[tuple[str, ...], ...] = (("seen", "seen"),) * 30) -> Any:
@@ -42,3 +42,4 @@ def test_limbs_have_names_that_people_use(bone: str, words: str) -> None:
 
 def test_frames_in_a_row_are_written_as_one() -> None:
     assert frame_list([5]) == "5" and frame_list([0, 1, 2]) == "0–2" and frame_list([]) == ""
+    assert frame_list([3, 7, 8, 9], 1) == "3 …" and frame_list([3, 7, 8, 9], 2) == "3, 7–9"
