@@ -71,9 +71,11 @@ def faired_outside_folds(vertices: np.ndarray, faces: np.ndarray, fair: np.ndarr
 
 
 def without_slits(before: np.ndarray, vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) of which those that `may` (V,) follow the ones `before` (V, 3) about slits.  (1)"""
+    """Vertices (V, 3) of which those that `may` (V,) follow the ones `before` (V, 3) about slits (1); none on a mesh that is too coarse."""
     beyond, near = beyond_edges(faces)[0], mean_of_neighbours(faces, len(vertices))
     limit, allowed = np.maximum(SLIT, turns(before, faces, beyond) + SLACK), may[faces].all(axis=1)
+    if _too_coarse(vertices, faces, beyond, allowed):
+        return vertices
     found = best = vertices
     least, moved = len(faces), np.zeros(len(vertices), dtype=bool)
     for step in range(SLIT_ROUNDS):
@@ -110,7 +112,7 @@ def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.
     beyond, near = beyond_edges(faces)[0], mean_of_neighbours(faces, len(vertices))
     found, allowed = np.array(vertices), may[faces].all(axis=1)
     limit = LARGEST_TURN if earlier is None else np.maximum(LARGEST_TURN, 1.001 * turns(earlier, faces, beyond))
-    if (turns(found, faces, beyond)[allowed] > LARGEST_TURN).sum() > COARSE * 4 * allowed.sum():
+    if _too_coarse(found, faces, beyond, allowed):
         return found
     touched = np.zeros(len(vertices), dtype=bool)
     for step in range(EASING_STEPS):
@@ -122,6 +124,11 @@ def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.
         found[rows] += 0.5 * share[rows, None] * (near[rows] @ found - found[rows])
         touched[rows] = True
     return _where_better(vertices, found, faces, near, np.flatnonzero(touched))
+
+
+def _too_coarse(vertices: np.ndarray, faces: np.ndarray, beyond: np.ndarray, among: np.ndarray) -> bool:
+    """Whether too many edges of the faces `among` (F,) turn too much, as those of a mesh that is too coarse for its surface do."""
+    return bool((turns(vertices, faces, beyond)[among] > LARGEST_TURN).sum() > COARSE * 4 * among.sum())
 
 
 def _where_better(before: np.ndarray, after: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix", rows: np.ndarray) -> np.ndarray:

@@ -74,6 +74,8 @@ def test_a_slit_is_closed_and_the_rest_stays() -> None:
     assert np.array_equal(found[far > 0.3], torn[far > 0.3])
     assert np.abs(found - skin.vertices_m).max() < 0.001
     assert np.array_equal(without_slits(skin.vertices_m, torn, skin.faces, ~every), torn)
+    coarse = skin.vertices_m + 0.002 * np.random.default_rng(0).standard_normal(skin.vertices_m.shape)
+    assert np.array_equal(without_slits(skin.vertices_m, coarse, skin.faces, every), coarse)
 
 
 def test_an_easing_that_turns_edges_more_is_left_out() -> None:
