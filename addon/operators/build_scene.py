@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
-from mathutils import Matrix, Vector
+from mathutils import Matrix, Quaternion, Vector
 
 from ...core.body.fields import POTENTIALS
 from ...core.foundation.progress import Monitor
@@ -28,6 +28,7 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 DEFAULT_LIGHT_M = (4.07625, 1.00545, 5.90386)  # where the light of Blender's startup file is
 DEFAULT_CAMERA_M = (7.35889, -6.92579, 4.95831)  # and its camera
+FRONT = Quaternion((1.0, 0.0, 0.0), math.pi / 2)  # of a view along +y
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
@@ -181,8 +182,9 @@ def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, thi
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
         region = next(r for r in area.regions if r.type == "WINDOW")
         with context.temp_override(area=area, region=region):
-            if front:
-                bpy.ops.view3d.view_axis(type="FRONT")
+            if front:  # at once: the next operator would stop a view that is still turning
+                view = area.spaces.active.region_3d
+                view.view_rotation, view.view_perspective = FRONT, "ORTHO"
             bpy.ops.view3d.view_selected()
     show_all_frames(context)
 

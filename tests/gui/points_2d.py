@@ -91,7 +91,9 @@ def followed(area: bpy.types.Area, take: Path, clip: bpy.types.MovieClip, at: np
     yield from drive.settle()
     drive.check(bpy.data.objects["Cube"].hide_get(), "Blender's cube makes room")
     with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
-        bpy.ops.view3d.view_axis(type="FRONT")
-        bpy.ops.view3d.view_all()
+        module("addon.operators.build_scene").frame_in_views(None, bpy.context, bpy.data.objects["Footage"], front=True)
     yield from drive.pause(0.5)
+    view = area.spaces.active.region_3d
+    drive.check(abs(view.view_rotation.to_euler().x - np.pi / 2) < 1e-3, "the picture is seen from the front")
+    drive.check(0.5 < view.view_distance / bpy.data.objects["Footage"].empty_display_size < 4, "… and fills the view")
     yield from drive.shot("3_in_the_scene")
