@@ -27,7 +27,7 @@ from tricap.core.run.batch import out_folders
 from tricap.core.tracking.point_tables import read_planar, read_points
 
 HERE = Path(__file__).resolve().parent
-COUNT = 60
+COUNT = 40
 
 
 def fuzz(folder: Path, count: int, *names: str) -> tuple[list[dict], str]:

@@ -26,6 +26,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return with_small_texture(folder)
 
 
+@pytest.mark.slow
 def test_a_run_with_a_model_of_ones_own_ends_in_a_scene(
     empty: ModuleType, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

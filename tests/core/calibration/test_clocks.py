@@ -74,6 +74,7 @@ def test_three_rates_calibrate_as_well_as_one() -> None:
     assert error_m(cameras, mixed.rig.cameras) < 1.2 * error_m(cameras, same.rig.cameras) + 2e-5
 
 
+@pytest.mark.slow
 def test_fisheye_cameras_at_three_rates() -> None:
     cameras = fisheye_cameras(np.random.default_rng(5))
     late_s = np.array([0.0, 0.011, -0.017])

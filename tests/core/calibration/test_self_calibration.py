@@ -217,6 +217,7 @@ def test_fisheye_lenses_are_calibrated_with_a_bar(lens: Lens) -> None:
     assert error_m(waved.cameras, done.rig.cameras) < 2e-4
 
 
+@pytest.mark.slow
 def test_fisheye_cameras_that_are_not_in_step_are_calibrated() -> None:
     """Measured over 10 rigs, up to 4 images apart: right to 0.0004 images, 0.06 to 0.34 mm."""
     rng = np.random.default_rng(1)

@@ -142,6 +142,7 @@ def test_lenses_alone_are_taken_from_cameras_that_stood_elsewhere() -> None:
         calibrated(waved, apart.changed(mixed))
 
 
+@pytest.mark.slow
 def test_bars_before_fisheye_lenses_of_a_board() -> None:
     rng = np.random.default_rng(8)
     cameras = fisheye_cameras(rng)

@@ -396,6 +396,7 @@ def test_movies_of_another_rate_than_the_takes_are_told(arm_recording: Record, t
     assert not rate_findings(open_take(read_take(take)))
 
 
+@pytest.mark.slow
 def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp_path: Path) -> None:
     take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
     said = {}

@@ -72,6 +72,7 @@ def test_keypoints_stand_for_a_surface_that_cannot_be_measured(tmp_path: Path) -
     assert (out / "report" / "report.html").exists() and pipeline.is_complete(job)
 
 
+@pytest.mark.slow
 def test_outlines_alone_and_nothing_is_measured_where_it_is_not_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take, out, joints = tmp_path / "take", tmp_path / "out", _joints()[0]
     clicks = {name: {c.name: c.project(X).round(1).tolist() for c in three_cameras().cameras}

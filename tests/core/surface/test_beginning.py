@@ -47,6 +47,7 @@ def measured(take: Path, out: Path) -> tuple[list[int], dict[str, Any]]:
         return [s.points for s in run.measured.summaries], run.record
 
 
+@pytest.mark.slow
 def test_a_take_whose_first_frames_show_nobody_begins_in_another(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
     take = emptied(plane_take, tmp_path / "take", scenes, range(2))
     points, record = measured(take, tmp_path / "out")
