@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.foundation.bounded import real_path
+from ..core.foundation.bounded import real_path, real_place
 from ..core.foundation.errors import InputError
 
 
@@ -50,14 +50,29 @@ def check_writable(folder: Path) -> None:
 
 
 def absolute(path: str) -> Path:
-    """The full path of what a user chose.
+    """The full path of what a user chose, to read it; links are followed.
 
     Raises:
         InputError: it is relative to a .blend that was never saved.
     """
+    return real_path(_from_blend(path))
+
+
+def to_write(path: str) -> Path:
+    """The full path of a file that a user chose, to write it; a link of this name will be replaced, not followed.
+
+    Raises:
+        InputError: none was chosen, or it is relative to a .blend that was never saved.
+    """
+    if not path:
+        raise InputError("Choose the file to write.")
+    return real_place(_from_blend(path))
+
+
+def _from_blend(path: str) -> str:
     if path.startswith("//") and not bpy.data.filepath:
-        raise InputError(f"The folder {path} is relative to the Blender file, which was never saved. Save it, or choose a full path.")
-    return real_path(bpy.path.abspath(path))
+        raise InputError(f"{path} is relative to the Blender file, which was never saved. Save it, or choose a full path.")
+    return str(bpy.path.abspath(path))
 
 
 def for_user(path: Path) -> str:

@@ -88,7 +88,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         if not (self.bar or props.bar):
             raise InputError("Choose the target footage first: the folder that contains a folder of images, or a movie, for each camera.")
         folder = folders.absolute(self.bar or props.bar)
-        out = folders.absolute(self.out) if self.out else folder.parent / "rig.toml"
+        out = folders.to_write(self.out) if self.out else folder.parent / "rig.toml"
         folders.check_writable(out.parent)
         length, diameter = (typed(value) for value in (self.length_m or props.length_m, props.diameter_m))
         mask = folders.absolute(props.mask) if props.mask else None
@@ -264,7 +264,7 @@ class PrintBoard(TellingOperator, ExportHelper, bpy.types.Operator):
         props = context.scene.tricap_calibrate
         if props.target == "WAND":
             raise InputError("Choose ChArUco or Checkerboard first; a wand is not printed.")
-        board, path = board_of(props, props.target), folders.absolute(self.filepath)
+        board, path = board_of(props, props.target), folders.to_write(self.filepath)
         write_board(path, board)
         return f"A {board.kind.value} of {board.label} in {path}. Print it without scaling."
 
@@ -299,7 +299,7 @@ class ExportRig(TellingOperator, ExportHelper, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Read the scene and write the file."""
-        rig, path = rig_of_scene(context.scene), folders.absolute(self.filepath)
+        rig, path = rig_of_scene(context.scene), folders.to_write(self.filepath)
         if self.layout_name == "tricap":
             write_rig(path, rig)
         else:

@@ -118,7 +118,7 @@ class BuildScene(JobOperator, bpy.types.Operator):
             implicit=self.implicit,
             field=self.field,
         )
-        put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
+        put_into_scene(self, context, result, folders.to_write(self.blend) if self.blend else None, options)
         return {"FINISHED"}
 
 

@@ -11,6 +11,7 @@ from ...core.motion.retarget.mapping import MappedMotion, write_map
 from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.roles import ROLES
 from ...core.motion.retarget.transfer import offsets_of_pose
+from .. import folders
 from ..panels import TellingOperator
 from . import apply, properties, saved_maps
 from .operators import armature_of
@@ -64,7 +65,7 @@ class LoadMap(TellingOperator, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Fill the editor."""
-        return show_map(self, context, Path(bpy.path.abspath(self.filepath)))
+        return show_map(self, context, folders.absolute(self.filepath))
 
 
 class SaveMap(TellingOperator, bpy.types.Operator):
@@ -87,7 +88,8 @@ class SaveMap(TellingOperator, bpy.types.Operator):
         rig_map = properties.edited_map(props, props.rows_of)
         if rig_map is None:
             raise InputError("There is no mapping to save; press Recognise first.")
-        write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
+        file = folders.to_write(self.filepath)
+        write_map(file, rig_map, file.stem)
         return ""
 
 

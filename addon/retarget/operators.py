@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import bpy
@@ -14,6 +13,7 @@ from ...core.motion.retarget.mapping import MappedMotion, MappedRig
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, begun_at_rest
 from ...core.motion.retarget.rig import Motion, resampled
 from ...core.motion.sources import read_motion_source
+from .. import folders
 from ..jobs import JobOperator
 from ..panels import TellingOperator
 from ..properties import snapshot
@@ -65,14 +65,14 @@ class Retarget(JobOperator, bpy.types.Operator):
         edited = properties.edited_map(props, self._target) if not self.map else None
         self._edited = edited
         self._unused_mapping = properties.foreign_mapping_note(props, self._target) if not self.map else ""
-        self._mapped_target = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
+        self._mapped_target = apply.read_target(self._target, folders.absolute(self.map) if self.map else None, edited)
         target, scene = self._mapped_target, context.scene
         fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
         if moving is not None:
             self._name = f"{moving.name} on {self._target.name}"
             motion = with_residual_motion(moving, read_motion(moving, read_rig(moving), action_frames(moving)))
             return lambda monitor: compute(lambda: motion, target, settings, feet, monitor)
-        path, file_axes = Path(bpy.path.abspath(self.file or props.file)), properties.axes_of_file(props)
+        path, file_axes = folders.absolute(self.file or props.file), properties.axes_of_file(props)
         self._name = path.stem
         return lambda monitor: compute(
             lambda: resampled(read_motion_source(path, **file_axes), fps, start), target, settings, feet, monitor

@@ -95,9 +95,11 @@ def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray]
     `bar`: frames and ends [m] of the wand, if they come from one.
 
     Raises:
-        InputError: a view has no camera of its name, or the project's folder cannot be written to.
+        InputError: there are no views, one has no camera of its name, or the project's folder cannot be written to.
     """
     views = scene.tricap.views
+    if not views:
+        raise InputError("Add the footage first (step 1); then its cameras can be chosen.")
     found = {view.name: rig[view.name] for view in views}
     for place, name in enumerate(from_left_to_right(replace(rig, cameras=tuple(found.values())))):
         views.move(views.find(name), place)

@@ -90,9 +90,7 @@ class Export(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], str | Motion]:
         """What is exported, and the file."""
-        if not self.filepath:
-            raise InputError("Choose the file to export to.")
-        kind, preset, chosen = self.kind, self.preset, folders.absolute(self.filepath)
+        kind, preset, chosen = self.kind, self.preset, folders.to_write(self.filepath)
         if self.source == "PLAYED" and not self.out:
             self._armature, self._file = self._playing(context), named_for(kind, chosen, _results(context.scene))
             return lambda monitor: ""

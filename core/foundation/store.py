@@ -52,9 +52,11 @@ def written(path: Path) -> Iterator[BinaryIO]:
     """A file to be written piece by piece; it gets its name when the block ends without an error, and does not exist otherwise.
 
     Raises:
-        InputError: the folder cannot be written to, or the disk is full.
+        InputError: the path has no name of a file, the folder cannot be written to, or the disk is full.
     """
     path = Path(path)
+    if not path.name:
+        raise InputError(f"“{path}” is no name of a file; choose a name to write.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         name = path.with_name(f".{path.name}.{os.urandom(4).hex()}.part")
