@@ -26,7 +26,7 @@ from ..core.fitting.inputs.start_joints import NeedsClick
 from ..core.foundation.errors import InputError, sentence_of
 from ..core.foundation.progress import Cancelled, Monitor, time_text
 from ..core.foundation.threads import one_thread_in_linear_algebra
-from .panels import show_status
+from .panels import check_own, show_status
 from .session import get_session
 
 log = logging.getLogger(__name__)
@@ -281,6 +281,7 @@ class JobOperator:
 
     def _prepare(self, context: bpy.types.Context) -> Job | None:
         try:
+            check_own(context.scene)
             return Job(self.snapshot(context), self.steps, self.step)
         except Exception as error:  # the edge of the operator: faults of the input and of the system are told, bugs are raised
             reason = sentence_of(error)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import blf
 import bpy
 
-from ..core.foundation.errors import sentence_of
+from ..core.foundation.errors import InputError, sentence_of
 from .session import get_session
 
 # of a sidebar, at the interface's usual scale: what is left and right of its texts, the icon before them, and texts at least
@@ -27,6 +27,7 @@ class TellingOperator:
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Do it."""
         try:
+            check_own(context.scene)
             message = self.do(context)
         except Exception as error:  # the edge of the operator: faults of the input and of the system are told, bugs are raised
             reason = sentence_of(error)
@@ -45,6 +46,18 @@ class TellingOperator:
             InputError: it cannot be done; nothing was changed.
         """
         raise NotImplementedError
+
+
+def check_own(scene: bpy.types.Scene) -> None:
+    """Check that a scene can be changed.
+
+    Raises:
+        InputError: it is linked from another file.
+    """
+    if scene.library is not None:
+        raise InputError(
+            f"The scene “{scene.name}” is linked from another file. Open that file, or link its collections into your own scene."
+        )
 
 
 def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:

@@ -18,7 +18,7 @@ from ..core.take.footage import open_take as open_footage
 from ..core.take.take import read_take
 from ..core.take.writing import read_table
 from . import folders, project, properties
-from .scene import armature, clips
+from .scene import armature, clips, stored
 from .scene.options import OUT_KEY, PLACES_KEY
 from .session import get_session
 
@@ -32,7 +32,7 @@ def show_built_project(scene: bpy.types.Scene) -> bool:
     built = next((c for c in scene.collection.children_recursive if OUT_KEY in c), None)
     if built is None or project.bound(scene) or scene.tricap.take or not bpy.data.filepath:
         return False
-    out = _place(built, "out", Path(built[OUT_KEY]), "run.json")
+    out = _place(built, "out", Path(stored.text(built, OUT_KEY)), "run.json")
     if out is None:
         return False
     scene.tricap.out = folders.for_user(out)
@@ -53,9 +53,9 @@ def show_built_project(scene: bpy.types.Scene) -> bool:
 
 def _place(built: bpy.types.Collection, what: str, absolute: Path, file: str) -> Path | None:
     """The folder of results or take that contains `file`: first relative to the .blend, then where it was."""
-    relative = dict(built.get(PLACES_KEY, {})).get(what)
-    beside = [Path(bpy.data.filepath).parent / relative] if relative else []
-    return next((real_path(place) for place in (*beside, absolute) if (place / file).is_file()), None)
+    relative = stored.table(built, PLACES_KEY).get(what)
+    beside = [Path(bpy.data.filepath).parent / relative] if isinstance(relative, str) else []
+    return next((real_path(place) for place in (*beside, absolute) if place.is_absolute() and (place / file).is_file()), None)
 
 
 def _choose_body(scene: bpy.types.Scene, built: bpy.types.Collection) -> None:

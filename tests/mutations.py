@@ -3,10 +3,12 @@
     python tests/mutations.py FOLDER COUNT [NAME…]      COUNT damaged copies for each reader; one line of JSON each on standard output
 
 A copy is damaged as transfers, disks and strangers do it: cut, with bytes changed, numbers too large or not finite, values of another kind,
-nested too deeply, with endless lines, in another encoding, empty. Never larger than a megabyte. In place of every file there is then
-something that is no file, or far too large: SPECIAL; and the sound files are read in folders with the names of FOLDER_NAMES.
+nested too deeply, with endless lines, in another encoding or spelling, packed, empty. Never larger than a megabyte. In place of every file
+there is then something that is no file, or far too large: SPECIAL; and the sound files are read in folders with the names of FOLDER_NAMES.
 """
 
+import gzip
+import io
 import json
 import os
 import random
@@ -18,6 +20,7 @@ import struct
 import sys
 import time
 import traceback
+import zipfile
 import zlib
 from collections.abc import Callable
 from itertools import product
@@ -176,6 +179,41 @@ def _encoded(data: bytes, r: random.Random) -> bytes:
     return data[:i] + what + data[i:]
 
 
+def _spelled(data: bytes, r: random.Random) -> bytes:
+    """Text as other countries and programs write it: decimal commas, digits of other scripts, formulas, quotes, other ends of lines."""
+    what = r.randrange(5)
+    if what == 0:
+        return re.sub(rb"(\d)\.(\d)", rb"\1,\2", data)
+    if what == 1:
+        digits = r.choice(("\u0660", "\u0966", "\uff10", "\U0001d7ce"))  # zeros of scripts whose digits Python's int reads, too
+        place = _place(data, r)
+        return data[:place] + re.sub(rb"\d", lambda m: chr(ord(digits) + int(m.group())).encode(), data[place:], count=r.choice((1, 9999)))
+    if what == 2:
+        begin = r.choice((b"=", b"+", b"-", b"@", b"\t=", b'"=', b"=HYPERLINK(", b"'"))
+        return re.sub(rb"(^|,|\n)([A-Za-z])", rb"\g<1>" + begin + rb"\g<2>", data, count=r.choice((1, 9999)))
+    if what == 3:
+        return re.sub(rb"(^|[,\n])([^,\n]*)", rb'\1"\2"', data, count=r.choice((1, 9999)))
+    return data.replace(b"\n", r.choice((b"\r", b"\r\n", b"\n\r", b"\x0b", b"\x0c", "\u2028".encode(), b"\x85", b"\0")))
+
+
+def _packed(data: bytes, r: random.Random) -> bytes:
+    """The file in an archive, in another file's clothes, or twice."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr(r.choice(("header_json.npy", "../a", "a" * 300, "\u202e")), data)
+    heads = (
+        b"%PDF-1.7\n",
+        b"\x89PNG\r\n\x1a\n",
+        b"BLENDER",
+        b"glTF\x02\0\0\0",
+        b"ply\nformat ascii 1.0\n",
+        b"RIFF",
+        b"#!/bin/sh\n",
+        b"<?xml?>",
+    )
+    return r.choice((gzip.compress(data, mtime=0), archive.getvalue(), r.choice(heads) + data, data + data, data[::-1]))
+
+
 def _nothing(data: bytes, r: random.Random) -> bytes:
     return r.choice((b"", b"\n", b"\0" * 100, b"\xef\xbb\xbf" + data, data.decode("latin-1").encode("utf-16")))
 
@@ -193,7 +231,7 @@ def _sound_sums(data: bytes, r: random.Random) -> bytes:
 
 DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
     _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _node, _node, _all_different, _insert, _deep, _deep,
-    _indented, _encoded, _nothing, _sound_sums)  # fmt: skip
+    _indented, _encoded, _spelled, _spelled, _packed, _nothing, _sound_sums)  # fmt: skip
 
 
 def memory_mb() -> tuple[float, float]:

@@ -15,8 +15,8 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.geometry.rig import Rig
-from ..scene import axes, clips
-from ..scene.cameras import add_camera, frame_render
+from ..scene import axes, clips, stored
+from ..scene.cameras import SIZE_KEY, add_camera, frame_render
 from ..scene.surroundings import add_bar
 
 COLLECTION = "Tricap Rig"
@@ -103,8 +103,8 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     if data.type != "PERSP":
         raise InputError(f"{camera_object.name} is not a perspective camera. Change the lens type in its properties.")
     clip = clip_behind(camera_object)
-    own = camera_object.get("tricap_size_px")
-    size = tuple(int(v) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
+    own = stored.numbers(camera_object, SIZE_KEY, 2)
+    size = tuple(max(1, int(v)) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
     aspect = clip.tracking.camera.pixel_aspect if clip else scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
     w, h = size
     upright = data.sensor_fit == "VERTICAL" or (data.sensor_fit == "AUTO" and h * aspect > w)
@@ -115,8 +115,8 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     name = str(camera_object.get("tricap_view", camera_object.name))
     matrix = np.array([[fx, 0, cx], [0, fx / aspect, cy], [0, 0, 1]])
     read = Camera(name=name, size_px=(w, h), matrix=matrix, distortions=np.zeros(5), R_cam_world=R, t_cam_world_m=t)
-    stored = camera_object.get(EXACT)
-    exact = None if stored is None else _exact_camera(read, np.array(stored))
+    values = stored.numbers(camera_object, EXACT, 28, 29)
+    exact = None if values is None else _exact_camera(read, np.array(values))
     read = replace(read, distortions=_distortions(clip, exact))
     return exact if exact is not None and _unchanged(read, exact, clip is not None) else read
 

@@ -7,6 +7,7 @@ import bpy
 from ...core.foundation.errors import InputError
 from .. import clicks, project
 from ..overlay import canvas
+from ..scene import stored
 from ..session import get_session
 
 NAME, REVIEW = "Tricap Clicks", "Tricap Review"
@@ -95,7 +96,7 @@ class BackToSteps(bpy.types.Operator):
         """Show that workspace; if it was deleted, any other with a 3-D view."""
         others = [w for w in bpy.data.workspaces if w.name not in OURS]
         spatial = [w for w in others if any(a.type == "VIEW_3D" for screen in w.screens for a in screen.areas)]
-        origin = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
+        origin = bpy.data.workspaces.get(stored.text(context.workspace, FROM_KEY))
         back = origin if origin in others else next(iter([*spatial, *others]), None)
         if back is None:
             self.report({"ERROR"}, "There is no other workspace. Add one with the + at the top of the window.")

@@ -11,6 +11,7 @@ from .. import project
 from ..editing.curves import keys_of
 from ..operators.stages import Fit, StageOperator, run_and_read
 from ..overlay import canvas, results
+from ..scene import stored
 from ..scene.action import set_keys
 from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
 from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, curves_of
@@ -57,13 +58,15 @@ def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
     """Add what the new fit changed to the actions of a body: the measured one, and the edited one with its edits."""
     from ..scene.armature import channel_of
 
-    pose, none = str(body.data.get(REST_POSE_KEY, "A")), np.zeros_like(again.before)
+    pose, none = "T" if body.data.get(REST_POSE_KEY) == "T" else "A", np.zeros_like(again.before)
     before, after = (with_rest_pose(again.shape, values, none, pose)[1] for values in (again.before, again.after))
     change = {name: column for name, column in zip(again.dof_names, (after - before).T) if np.abs(column).max() > 0}
-    stand = Standing(lift_m=body.data[LIFT_KEY], floor_m=body.location.z) if LIFT_KEY in body.data else None
+    lift_m = stored.number(body.data, LIFT_KEY)
+    stand = Standing(lift_m=lift_m, floor_m=body.location.z) if lift_m is not None else None
     channels = channel_of(again.shape, stand)
     moved = {(f'pose.bones["{c.bone}"].{c.path}', c.index): c.sign * change[name] for name, c in channels.items() if name in change}
-    actions = {action for action in (body.animation_data and body.animation_data.action, body.get(MEASURED_KEY)) if action is not None}
+    measured = stored.data_block(body, MEASURED_KEY, bpy.types.Action)
+    actions = {action for action in (body.animation_data and body.animation_data.action, measured) if action is not None}
     for curve in (curve for action in actions for curve in curves_of(action)):
         if (curve.data_path, curve.array_index) in moved:
             _add(curve, again.frames, moved[curve.data_path, curve.array_index])

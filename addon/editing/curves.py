@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ...core.foundation.errors import InputError
+from ..scene import stored
 from ..scene.action import UNCERTAINTY
 from ..scene.standing import MEASURED_KEY, RIG_KEY, curves_of
 
@@ -27,10 +28,10 @@ def motion_curves(body: bpy.types.Object, *, selected: bool = False) -> list[bpy
     Raises:
         InputError: it plays no action of its own, a control rig drives it, or no bone with keys is selected.
     """
-    rig, data = body.get(RIG_KEY), body.animation_data
+    rig, data = stored.data_block(body, RIG_KEY, bpy.types.Object), body.animation_data
     if rig is not None and rig.name in bpy.context.scene.objects:
         raise InputError(f"“{rig.name}” drives “{body.name}”; edit the motion before the control rig is made, or delete that first.")
-    if data is None or data.action is None:
+    if data is None or data.action is None or data.action_slot is None:
         raise InputError(f"“{body.name}” has no action to edit; choose one in the Action Editor, or build the rig again (step 7).")
     curves = [c for c in curves_of(data.action) if (at := BONE.fullmatch(c.data_path)) and at[2] in CHANNELS and len(c.keyframe_points)]
     if selected and body.mode == "POSE":
@@ -44,7 +45,7 @@ def motion_curves(body: bpy.types.Object, *, selected: bool = False) -> list[bpy
 def edited_action(body: bpy.types.Object, name: str = EDITED) -> bpy.types.Action:
     """The body's action, ready for edits: of the measured motion a copy, which leaves the measured one as it is."""
     data = body.animation_data
-    if body.get(MEASURED_KEY) is None:
+    if stored.data_block(body, MEASURED_KEY, bpy.types.Action) is None:
         body[MEASURED_KEY] = data.action  # counts as a user, so that it is saved
         slot = data.action_slot.identifier
         data.action = data.action.copy()

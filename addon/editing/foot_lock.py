@@ -25,7 +25,7 @@ from ..retarget.apply import map_of
 from ..retarget.playing import played_frames
 from ..retarget.read import read_motion, read_rig
 from ..scene.action import key
-from ..scene.standing import DOFS_KEY, bags_of
+from ..scene.standing import bags_of, dofs_of
 from .curves import edited_action, motion_curves
 
 LOCK, EMPTY, ACTION = "Foot lock", "Foot Lock", "Foot lock"
@@ -159,7 +159,7 @@ def _lock(body: bpy.types.Object, motion: Motion, side: str, rig_map: RigMap, st
 
 def _limit_bend(body: bpy.types.Object, limit: bpy.types.LimitRotationConstraint, dof: str) -> None:
     """Bend a knee that is straight or overextended: from there inverse kinematics would bend it further the wrong way, or not at all."""
-    channel = body.data.get(DOFS_KEY, {}).get(dof)
+    channel = dofs_of(body).get(dof)
     if channel is None:
         return
     axis, bone = "xyz"[channel["index"]], body.pose.bones[channel["bone"]]

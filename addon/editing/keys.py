@@ -7,7 +7,7 @@ from ...core.foundation.errors import InputError
 from ...core.motion.retarget.rig import needed_keys
 from ...core.motion.smoothing import smooth
 from ..scene.action import METRES_PER_RADIAN, SIMPLE_NAME, set_keys
-from ..scene.standing import DOFS_KEY
+from ..scene.standing import dofs_of
 from .curves import bone_of, curves_of, edited_action, keys_of, motion_curves, sigma_curves
 
 
@@ -18,7 +18,7 @@ def smooth_uncertain(body: bpy.types.Object, acceleration: float) -> str:
         InputError: there is nothing to edit, or the sigmas are missing.
     """
     sigmas, scene = sigma_curves(body), bpy.context.scene
-    dofs = {(dof["bone"], dof["path"], dof["index"]): name for name, dof in dict(body.data.get(DOFS_KEY, {})).items()}
+    dofs = {(dof["bone"], dof["path"], dof["index"]): name for name, dof in dofs_of(body).items()}
     named = [
         (curve, dofs.get((bone_of(curve), curve.data_path.rpartition(".")[2], curve.array_index)))
         for curve in motion_curves(body, selected=True)

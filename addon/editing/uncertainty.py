@@ -22,13 +22,13 @@ Sigmas = dict[str, tuple[np.ndarray, np.ndarray]]  # by bone: frames (T,), and t
 def sigmas_of(body: bpy.types.Object) -> Sigmas:
     """The sigmas of a body's bones; those of locations count as angles (METRES_PER_RADIAN)."""
     found: Sigmas = {}
-    dofs = dict(body.data.get(standing.DOFS_KEY, {}))
+    dofs = standing.dofs_of(body)
     for name, curve in sigma_curves(body).items():
         at = BONE.match(curve.data_path)
         if at is None or not len(curve.keyframe_points):
             continue
         frames, sigma = keys_of(curve)
-        in_metres = dict(dofs.get(name.removeprefix("sigma "), {})).get("path") == "location"
+        in_metres = dofs.get(name.removeprefix("sigma "), {}).get("path") == "location"
         sigma = np.degrees(sigma / (METRES_PER_RADIAN if in_metres else 1.0))
         before = found.get(at[1])
         found[at[1]] = (frames, np.maximum(before[1], sigma) if before is not None and len(before[1]) == len(sigma) else sigma)

@@ -21,6 +21,7 @@ from mathutils import Matrix, Vector
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
+from ..scene import stored
 from ..scene.armature import SNAPS_KEY
 from ..scene.standing import RIG_KEY, ROOT
 from . import metarig
@@ -37,6 +38,7 @@ CORRECTIONS = "Corrections"
 LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
 CHECKED_FRAMES = 25
 MOST_TURNS, SMALLEST_TURN_RAD = 6, 1e-5  # of the base of an IK limb, until its middle joint is where it was
+NEEDED = {"ctrl_bones", "tail_bones"}  # of the arguments of Rigify's snapping
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +80,8 @@ def make_control_rig(body: bpy.types.Object) -> Made:
 
 def rig_of(body: bpy.types.Object) -> bpy.types.Object | None:
     """The control rig of a body, if it has one."""
-    rig = body.get(RIG_KEY)
-    return rig if rig is not None and rig.name in bpy.context.scene.objects else None
+    rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
+    return rig if rig is not None and rig.type == "ARMATURE" and rig.name in bpy.context.scene.objects else None
 
 
 def _release(body: bpy.types.Object) -> None:
@@ -87,7 +89,8 @@ def _release(body: bpy.types.Object) -> None:
     for bone in body.pose.bones:
         for constraint in [c for c in bone.constraints if c.name == CONSTRAINT]:
             bone.constraints.remove(constraint)
-    deleted = body.pop(RIG_KEY, None)
+    deleted = stored.data_block(body, RIG_KEY, bpy.types.Object)
+    body.pop(RIG_KEY, None)
     if deleted is not None and not deleted.users_collection:
         bpy.data.objects.remove(deleted)
     bpy.context.view_layer.update()
@@ -247,15 +250,22 @@ def snap(body: bpy.types.Object, to: str, limbs: Sequence[str] = ()) -> int:
         raise InputError(f"“{body.name}” has no control rig; press Make Control Rig first.")
     if not rig.visible_get():
         raise InputError(f"The control rig “{rig.name}” is hidden; show it first.")
-    known = {name: arguments.to_dict() for name, arguments in rig[SNAPS_KEY].items()}
+    known = {name: row["IK"] for name, row in stored.rows(rig, SNAPS_KEY, IK=dict).items() if _is_limb(name) and NEEDED <= row["IK"].keys()}
+    if not known:
+        raise InputError(f"The limbs of the control rig “{rig.name}” are not stored in it; delete it, and make it again.")
     unknown = [limb for limb in limbs if limb not in known]
     if unknown:
         raise InputError(f"There is no limb “{unknown[0]}”; choose among {', '.join(known)}.")
     for limb in limbs or tuple(known):
-        (_snap_to_ik if to == "IK" else _snap_to_fk)(rig, body, limb, known[limb]["IK"])
+        (_snap_to_ik if to == "IK" else _snap_to_fk)(rig, body, limb, known[limb])
         if bpy.context.scene.tool_settings.use_keyframe_insert_auto:
-            _key_limb(rig, limb, known[limb]["IK"])
+            _key_limb(rig, limb, known[limb])
     return len(limbs or known)
+
+
+def _is_limb(name: str) -> bool:
+    """Whether a name is that of the first bone of an arm or a leg."""
+    return name in {f"{chain[0]}.{side}" for chain in metarig.LIMBS.values() for side in "LR"}
 
 
 def _chain(limb: str) -> tuple[str, str, str]:

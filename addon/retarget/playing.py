@@ -19,7 +19,7 @@ from ...core.foundation.progress import Monitor
 from ...core.motion.formats.markers import Markers
 from ...core.motion.formats.ply import write_mesh
 from ...core.motion.retarget.rig import Motion, Rig
-from ..scene import layers
+from ..scene import layers, stored
 from ..scene.armature import JOINTS_KEY
 from .read import read_rig, reading_motion
 
@@ -92,7 +92,8 @@ def exported_rig(armature_object: bpy.types.Object) -> Rig:
 def points_of_played(armature_object: bpy.types.Object, motion: Motion) -> Markers:
     """The joints of Tricap's own body, or the heads of another armature's bones; without sigmas, which only a measurement has."""
     names, places = list(motion.rig.names), [motion.head_m]
-    joints = {joint: (str(end["bone"]), bool(end["at_tail"])) for joint, end in armature_object.data.get(JOINTS_KEY, {}).items()}
+    ends = stored.rows(armature_object.data, JOINTS_KEY, bone=str, at_tail=int)
+    joints = {joint: (end["bone"], bool(end["at_tail"])) for joint, end in ends.items()}
     if joints and all(bone in motion.rig.index for bone, _ in joints.values()):
         length = np.linalg.norm(motion.rig.tail_m - motion.rig.head_m, axis=1)
         tail_m = motion.head_m + length[:, None] * motion.R[..., 1]
@@ -125,13 +126,15 @@ def copied_skins(skins: list[bpy.types.Object], source: bpy.types.Object, plain:
 
     Meanwhile the copies have the names of their originals.
     """
-    named = [(thing, thing.name) for mesh in skins for thing in (mesh, mesh.data)]
+    named = [(thing, thing.name) for mesh in skins for thing in (mesh, mesh.data) if thing.library is None]  # linked names are apart
     try:
         for mesh in skins:
-            name, data_name = mesh.name, mesh.data.name
             copied = _copied_skin(mesh, source, plain, scale)
-            mesh.name, mesh.data.name = f"{name} (original)", f"{data_name} (original)"
-            copied.name, copied.data.name = name, data_name
+            for original, copy in ((mesh, copied), (mesh.data, copied.data)):
+                name = original.name
+                if original.library is None:
+                    original.name = f"{name} (original)"
+                copy.name = name
         yield
     finally:
         for copied in [o for o in plain.children if o.type == "MESH"]:

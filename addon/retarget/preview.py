@@ -16,6 +16,7 @@ from ...core.motion.retarget.mapping import MappedRig, RigMap
 from ...core.motion.retarget.retarget import leg_ratio, nothing_in_common
 from ...core.motion.retarget.roles import part_of
 from ...core.motion.retarget.transfer import alignments, untwisted_bone, with_offsets
+from ..scene import stored
 
 NAME = "Tricap preview"
 EARLIER_KEY = "tricap_before_preview"  # custom property of the target: the earlier values of its controls' properties
@@ -57,9 +58,10 @@ def remove_preview(target: bpy.types.Object) -> int:
         for constraint in [c for c in bone.constraints if c.name.startswith(NAME)]:
             bone.constraints.remove(constraint)
             count += 1
-    for name, values in target.pop(EARLIER_KEY, {}).items():
+    for name, values in stored.rows(target, EARLIER_KEY).items():
         for key, value in values.items() if name in target.pose.bones else ():
             target.pose.bones[name][key] = value
+    target.pop(EARLIER_KEY, None)
     if not any(c.name.startswith(NAME) for o in bpy.data.objects if o.type == "ARMATURE" for b in o.pose.bones for c in b.constraints):
         for collection in [c for c in bpy.data.collections if c.name.startswith(NAME)]:
             bpy.data.batch_remove(list(collection.objects))

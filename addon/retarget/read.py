@@ -18,7 +18,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
-from ..scene import layers
+from ..scene import layers, stored
 from ..scene.armature import ROLES_KEY
 from ..scene.standing import curves_of
 
@@ -99,9 +99,9 @@ def orthonormal(M: np.ndarray) -> np.ndarray:
 
 def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
     """The bone of each part, as stored by Tricap's import or its own armatures, or by the VRM add-on."""
-    stored = armature_object.data.get(ROLES_KEY)
-    if stored is not None:
-        return {str(role): str(name) for role, name in stored.items() if name in armature_object.data.bones}
+    roles = stored.table(armature_object.data, ROLES_KEY)
+    if roles:
+        return {role: name for role, name in roles.items() if isinstance(name, str) and name in armature_object.data.bones}
     extension = getattr(armature_object.data, "vrm_addon_extension", None)
     found: dict[str, str] = {}
     for table in (_vrm1(extension), _vrm0(extension)):  # the table of the other version is empty
@@ -202,7 +202,11 @@ def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[in
 def reading_motion(
     armature_object: bpy.types.Object, rig: Rig, frames: Sequence[int], monitor: Monitor | None = None
 ) -> Generator[None, None, Motion]:
-    """`read_motion` with a step for each frame, so that the window can be drawn meanwhile."""
+    """`read_motion` with a step for each frame, so that the window can be drawn meanwhile.
+
+    Raises:
+        InputError: a bone has no place in some frame.
+    """
     scene = bpy.context.scene
     now, names, monitor = scene.frame_current, rig.names, monitor or Monitor()
     pose = np.empty((len(frames), len(names), 4, 4))
@@ -218,6 +222,10 @@ def reading_motion(
     finally:
         scene.frame_set(now)
     placed = world[:, None] @ pose
+    known = np.isfinite(placed).all(axis=(1, 2, 3))
+    if not known.all():
+        bad = f"“{armature_object.name}” has bones at no place in frame {frames[int(np.argmin(known))]}"
+        raise InputError(f"{bad}: a key, a constraint or a driver gives no number there. Repair it.")
     return Motion(
         rig=rig,
         fps=scene.render.fps / scene.render.fps_base,
@@ -255,14 +263,14 @@ def with_residual_motion(armature_object: bpy.types.Object, motion: Motion) -> M
     action = action_with_residual(armature_object)
     if action is None:
         return motion
-    stored = action[RESIDUAL_KEY]
-    if keys_digest(action) != stored["keys"]:
+    residual = stored.table(action, RESIDUAL_KEY)
+    if keys_digest(action) != residual["keys"]:
         note = (
             f"“{action.name}” was edited since it was retargeted: the detail of its source that its rig cannot show is lost. "
             "Edit in an NLA layer above it to keep that detail"
         )
         return replace(motion, notes=(*motion.notes, note))
-    return replace(motion, residual=from_text(stored["motion"]).at(motion.frames))
+    return replace(motion, residual=from_text(residual["motion"]).at(motion.frames))
 
 
 def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action | None:
@@ -270,8 +278,13 @@ def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action 
     data = armature_object.animation_data
     strips = [strip for track in data.nla_tracks if not track.mute for strip in track.strips if not strip.mute]
     own_time = [s.action for s in strips if s.action and s.scale == 1.0 and s.repeat == 1.0 and s.frame_start == s.action_frame_start]
-    found = [action for action in (data.action, *own_time) if action is not None and RESIDUAL_KEY in action]
+    found = [action for action in (data.action, *own_time) if action is not None and _has_residual(action)]
     return found[0] if len(found) == 1 else None
+
+
+def _has_residual(action: bpy.types.Action) -> bool:
+    residual = stored.table(action, RESIDUAL_KEY)
+    return all(isinstance(residual.get(name), str) for name in ("motion", "keys"))
 
 
 def keys_digest(action: bpy.types.Action) -> str:

@@ -24,7 +24,7 @@ from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, surroundings
+from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, stored, surroundings
 from .cloud import CloudPoints, add_cloud, pixel_size_m
 from .contents import Contents, read_contents
 from .looking import look_at
@@ -150,11 +150,11 @@ def remove_earlier() -> list[str]:
     scene, removed = bpy.context.scene, []
     for collection in built_collections(scene):
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
-        for rig in [o[standing.RIG_KEY] for o in objects if o.get(standing.RIG_KEY) is not None]:
+        for rig in filter(None, [stored.data_block(o, standing.RIG_KEY, bpy.types.Object) for o in objects]):
             removed.append(f"The control rig “{rig.name}” was removed with the earlier body{_keep_corrections(rig)}.")
             objects += [rig, *{bone.custom_shape for bone in rig.pose.bones if bone.custom_shape is not None}]
         used = {id_ for o in objects for id_ in (o.data, o.animation_data.action if o.animation_data else None) if id_ is not None}
-        used |= {o[standing.MEASURED_KEY] for o in objects if o.get(standing.MEASURED_KEY) is not None}
+        used |= set(filter(None, [stored.data_block(o, standing.MEASURED_KEY, bpy.types.Action) for o in objects]))
         used |= {s.action for o in objects if o.animation_data for t in o.animation_data.nla_tracks for s in t.strips if s.action}
         used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
@@ -389,7 +389,7 @@ def _add_body(
     values, sigma = (motion.values, motion.sigma) if motion is not None else (np.zeros((0, n)), np.zeros((0, n)))
     measured_shape = shape
     shape, values, sigma = with_rest_pose(shape, values, sigma, options.rest_pose)
-    chosen = bpy.context.scene.get(standing.FLOOR_KEY)
+    chosen = stored.number(bpy.context.scene, standing.FLOOR_KEY)
     known_floor = float(chosen) if chosen is not None else 0.0 if _has_floor(contents) else None
     frames = motion.frames if motion is not None else np.zeros(0)
     rest_skin = contents.prepared.skin

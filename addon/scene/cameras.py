@@ -12,6 +12,7 @@ from .fisheye import nearest_brown
 DISPLAY_SIZE = 0.2  # of the camera's frame in the viewport, metres
 ASPECT_TOLERANCE_PX = 0.05
 FISHEYE_TOLERANCE_PX = 0.5
+SIZE_KEY = "tricap_size_px"  # custom property of a camera: width and height of its images
 
 
 def add_camera(collection: bpy.types.Collection, camera: Camera) -> bpy.types.Object:
@@ -26,7 +27,7 @@ def add_camera(collection: bpy.types.Collection, camera: Camera) -> bpy.types.Ob
     camera_object = bpy.data.objects.new(data.name, data)
     camera_object.matrix_world = Matrix(axes.camera_to_world(camera))
     camera_object["tricap_view"] = camera.name
-    camera_object["tricap_size_px"] = list(camera.size_px)
+    camera_object[SIZE_KEY] = list(camera.size_px)
     camera_object.lock_location = camera_object.lock_rotation = camera_object.lock_scale = (True, True, True)
     collection.objects.link(camera_object)
     return camera_object

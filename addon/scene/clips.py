@@ -12,7 +12,7 @@ from ...core.images.interlace import FieldLayout, field_pictures
 from ...core.images.sequence import ImageSequence, open_sequence
 from ...core.results.folder import FIELDS
 from .. import folders
-from . import axes
+from . import axes, stored
 
 FIELDS_KEY = "tricap_fields"  # custom property of a clip that shows single fields: the first field
 CLIP_KEY = "tricap_clip"  # custom property of a camera: the clip behind it
@@ -123,7 +123,7 @@ def clip_behind(camera_data: bpy.types.Camera) -> bpy.types.MovieClip | None:
     Blender (4.5, 5.2) leaves a dangling pointer to a deleted clip in the background image, and crashes when it is read or freed; a
     custom property that points to the clip is cleared instead. So the background image is removed without being read.
     """
-    clip = camera_data.get(CLIP_KEY)
+    clip = stored.data_block(camera_data, CLIP_KEY, bpy.types.MovieClip)
     if clip is None and CLIP_KEY in camera_data:
         camera_data.background_images.clear()
     return clip

@@ -5,6 +5,7 @@ lens shows these rays: the texture is undistorted as it is drawn, by EEVEE and C
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -12,7 +13,7 @@ import numpy as np
 
 from ...core.geometry.camera import Camera, image_of, interior_of
 from .. import folders
-from . import nodes
+from . import nodes, stored
 from .standing import FLOOR
 
 NAME = "Footage"
@@ -97,4 +98,7 @@ def show(scene: bpy.types.Scene, visible: bool) -> None:
         scene[EARLIER_KEY] = view.view_transform
         view.view_transform = PLAIN
     elif not visible and EARLIER_KEY in scene:
-        view.view_transform = scene.pop(EARLIER_KEY)
+        earlier = stored.text(scene, EARLIER_KEY)
+        with suppress(TypeError):  # no transform of this Blender's
+            view.view_transform = earlier
+        del scene[EARLIER_KEY]

@@ -11,6 +11,7 @@ person moves in place. Edited keys stay.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from ...core.body.shape import BodyShape
 from ...core.body.skeleton import bone_frames
 from ...core.foundation.errors import InputError
 from ..session import get_session
+from . import stored
 
 ROOT = "root"
 LIFT_KEY = "tricap_lift_m"  # custom property of armature data: by how much the rest pose of a standing body is raised
@@ -90,7 +92,14 @@ def all_bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
 
 def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
     """The armatures of Tricap's own bodies that stand on a floor."""
-    return (thing for thing in scene.objects if thing.type == "ARMATURE" and LIFT_KEY in thing.data and ROOT in thing.data.bones)
+    armatures = (thing for thing in scene.objects if thing.type == "ARMATURE")
+    return (thing for thing in armatures if stored.number(thing.data, LIFT_KEY) is not None and ROOT in thing.data.bones)
+
+
+def dofs_of(body: bpy.types.Object) -> dict[str, dict[str, Any]]:
+    """Bone, path and index of the channel of each degree of freedom of a body, as far as it has the bone."""
+    found = stored.rows(body.data, DOFS_KEY, bone=str, path=str, index=int)
+    return {name: dof for name, dof in found.items() if dof["bone"] in body.data.bones and dof["index"] in range(3)}
 
 
 def covered(body: bpy.types.Object) -> np.ndarray:
@@ -131,7 +140,7 @@ def carry_path(scene: bpy.types.Scene, by: Path) -> None:
 def floor_of(scene: bpy.types.Scene) -> float:
     """The height [m] of the floor on which the scene's body stands; that of the scene's own choice without one, or zero."""
     body = next(bodies(scene), None)
-    return float(body.location.z if body is not None else scene.get(FLOOR_KEY, 0.0))
+    return float(body.location.z if body is not None else stored.number(scene, FLOOR_KEY) or 0.0)
 
 
 def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
@@ -141,14 +150,13 @@ def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
         InputError: a control rig carries the body.
     """
     for body in bodies(scene):
-        if body.get(RIG_KEY) is not None and body[RIG_KEY].name in scene.objects:
-            raise InputError(
-                f"“{body[RIG_KEY].name}” drives “{body.name}”; set the floor before the control rig is made, or delete that first."
-            )
+        rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
+        if rig is not None and rig.name in scene.objects:
+            raise InputError(f"“{rig.name}” drives “{body.name}”; set the floor before the control rig is made, or delete that first.")
     scene[FLOOR_KEY] = height_m
     for body in bodies(scene):
         lower_m, body.location.z = height_m - body.location.z, height_m
-        height = next((dof for dof in body.data[DOFS_KEY].values() if dof["path"] == "location" and dof["bone"] != ROOT), None)
+        height = next((dof for dof in dofs_of(body).values() if dof["path"] == "location" and dof["bone"] != ROOT), None)
         if height is None:
             continue
         bone = body.pose.bones[height["bone"]]
@@ -174,7 +182,8 @@ def _actions(body: bpy.types.Object) -> set[bpy.types.Action]:
     """The actions that move a body: the active one, those in its layers, and the measured one."""
     data = body.animation_data
     strips = [strip.action for track in data.nla_tracks for strip in track.strips] if data is not None else []
-    return {action for action in (data.action if data is not None else None, body.get(MEASURED_KEY), *strips) if action is not None}
+    active, measured = data.action if data is not None else None, stored.data_block(body, MEASURED_KEY, bpy.types.Action)
+    return {action for action in (active, measured, *strips) if action is not None}
 
 
 def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:

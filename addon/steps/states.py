@@ -25,6 +25,7 @@ from ...core.take.footage import Footage, footage_frames, open_take
 from ...core.take.take import Take
 from .. import folders, project
 from ..clicking.click_session import joints_of as joints_in_order
+from ..scene import stored
 from ..scene.options import KEYS_KEY, OUT_KEY
 from ..session import get_session
 
@@ -312,7 +313,7 @@ def _figures(step: str, entry: Mapping[str, Any]) -> str:
 def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -> State:
     built = next((c for c in scene.collection.children_recursive if OUT_KEY in c), None)
     last = "tracks" if found.take is not None and found.take.body_model is None else "body"
-    so_far = built is not None and STAGE[last] not in dict(built.get(KEYS_KEY, {})) and not _has_armature(built)
+    so_far = built is not None and STAGE[last] not in stored.table(built, KEYS_KEY) and not _has_armature(built)
     if built is None or (so_far and found.take is not None and states[last].status != Status.STALE):
         if states[last].status != Status.DONE:
             return State(status=Status.EMPTY, message=f"Finish step {STEPS.index(last) + 1} first.")
@@ -321,7 +322,7 @@ def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -
     if states["body"].status == Status.DONE and not moving:
         return State(status=Status.STALE, message="The body's armature is missing from the scene. Build it again.")
     now = found.keys or {}
-    if found.keys is not None and any(now.get(stage) != key for stage, key in dict(built.get(KEYS_KEY, {})).items()):
+    if found.keys is not None and any(now.get(stage) != key for stage, key in stored.table(built, KEYS_KEY).items()):
         return State(status=Status.STALE, message="The scene shows an earlier result. Run the steps before, then build it again.")
     if found.keys is not None and lacks_results(built, found):
         return State(status=Status.STALE, message="There are results that the scene does not show yet. Build it again.")
@@ -335,7 +336,7 @@ def _has_armature(built: bpy.types.Collection) -> bool:
 def lacks_results(built: bpy.types.Collection, found: _Project) -> bool:
     """Whether a stage has results that the built scene lacks."""
     done = {s for s, entry in (found.run or {}).get("stages", {}).items() if s in STAGE.values() and "not_done" not in entry}
-    return bool(done - set(dict(built.get(KEYS_KEY, {})))) and OUT_KEY in built and str(found.out) == built[OUT_KEY]
+    return bool(done - set(stored.table(built, KEYS_KEY))) and OUT_KEY in built and str(found.out) == built[OUT_KEY]
 
 
 def _retarget(scene: bpy.types.Scene, rig: State) -> State:

@@ -1,5 +1,6 @@
 """Hostile scenes and names: each operator that writes a file replaces a link of the chosen name; each ends in a sentence."""
 
+import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from .conftest import SmallRun
-from .test_wrong_moves import refused
+from .test_wrong_moves import ADDON, refused
 
 EXPORTED = ("bvh", "c3d", "trc", "csv", "mot", "fbx", "glb", "usd", "abc")
 
@@ -61,3 +62,107 @@ def test_no_name_and_a_name_beside_no_file(built: ModuleType, small_run: SmallRu
 def test_cameras_before_the_footage(built: ModuleType, small_run: SmallRun) -> None:
     refused(built.ops.tricap.cameras_from_scene, "Add the footage first")
     refused(lambda: built.ops.tricap.cameras_from_file(filepath=str(small_run.take / "rig.toml")), "Add the footage first")
+
+
+LEAVE = {"load_sample", "open_report"}  # they take long, or open another program
+OTHER_KINDS = (7, "x\n\U0001f600", [1, 2, 3], {"a": {"b": 1}, "bone": "x"}, float("nan"))
+
+
+def every_operator(bpy: ModuleType, file: Path) -> set[str]:
+    """Press each button once: it ends, or refuses in one sentence. The names of those that ended."""
+    ended = set[str]()
+    for name in sorted(set(dir(bpy.ops.tricap)) - LEAVE):
+        arguments = {"kind": "bvh", "filepath": str(file)} if name == "export" else {}
+        try:
+            if getattr(bpy.ops.tricap, name)(**arguments) == {"FINISHED"}:
+                ended.add(name)
+        except RuntimeError as error:
+            said = str(error).strip()
+            assert "Traceback" not in said and "Internal error" not in said and "\n" not in said, (name, said)
+    importlib.import_module(f"{ADDON}.steps.watch").refresh(bpy.context.scene)  # what the panel draws
+    return ended
+
+
+def tamper(bpy: ModuleType, value: object) -> int:
+    """Give each of our custom properties this value, and the body those that it lacks; how many."""
+    body, count = bpy.data.objects["Body"], 0
+    body["tricap_control_rig"] = body["tricap_measured_motion"] = bpy.context.scene["tricap_floor_m"] = 0
+    blocks = ("objects", "armatures", "collections", "scenes", "actions", "cameras", "movieclips", "workspaces")
+    for thing in (thing for kind in blocks for thing in getattr(bpy.data, kind)):
+        for key in [key for key in thing.keys() if key.startswith("tricap_")]:
+            thing[key] = value
+            count += 1
+    return count
+
+
+@pytest.mark.parametrize("value", OTHER_KINDS, ids=lambda value: type(value).__name__)
+def test_custom_properties_of_other_kinds(built: ModuleType, tmp_path: Path, value: object) -> None:
+    """A stranger's file may hold anything in them."""
+    assert tamper(built, value) > 10
+    built.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    built.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert "export" in every_operator(built, tmp_path / "a.bvh")
+
+
+def without_slot(bpy: ModuleType) -> None:
+    bpy.data.objects["Body"].animation_data.action_slot = None
+
+
+def without_a_number(bpy: ModuleType) -> None:
+    body = bpy.data.objects["Body"]
+    for bag in (bag for layer in body.animation_data.action.layers for strip in layer.strips for bag in strip.channelbags):
+        bag.fcurves[-1].keyframe_points[2].co[1] = float("nan")
+
+
+def without_armature(bpy: ModuleType) -> None:
+    bpy.data.objects.remove(bpy.data.objects["Body"])
+
+
+def in_edit_mode(bpy: ModuleType) -> None:
+    bpy.context.view_layer.objects.active = bpy.data.objects["Body"]
+    bpy.ops.object.mode_set(mode="EDIT")
+
+
+def linked(bpy: ModuleType) -> None:
+    """The scene's collection from another file."""
+    file = Path(bpy.app.tempdir) / "library.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.context.scene.frame_end = 4
+    with bpy.data.libraries.load(str(file), link=True) as (there, here):
+        here.collections = ["Tricap"]
+    bpy.context.scene.collection.children.link(here.collections[0])
+    assert bpy.data.objects["Body"].library is not None and len(there.collections) > 1
+
+
+def linked_scene(bpy: ModuleType) -> None:
+    """The whole scene from another file, shown."""
+    file = Path(bpy.app.tempdir) / "library.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(file), link=True) as (there, here):
+        here.scenes = there.scenes
+    bpy.context.window.scene = here.scenes[0]
+
+
+def overridden(bpy: ModuleType) -> None:
+    linked(bpy)
+    bpy.context.scene.collection.children[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+
+
+@pytest.mark.parametrize(
+    "spoil", [without_slot, without_a_number, without_armature, in_edit_mode, linked, linked_scene, overridden], ids=lambda f: f.__name__
+)
+def test_scenes_that_somebody_changed(built: ModuleType, tmp_path: Path, spoil: Callable[[ModuleType], None]) -> None:
+    spoil(built)
+    every_operator(built, tmp_path / "a.bvh")
+
+
+def test_a_linked_body_is_exported_with_its_skin(built: ModuleType, tmp_path: Path) -> None:
+    linked(built)
+    body = next(thing for thing in built.context.scene.objects if thing.type == "ARMATURE")
+    assert built.ops.tricap.export(kind="fbx", filepath=str(tmp_path / "a.fbx"), armature=body.name) == {"FINISHED"}
+    names = {thing.name for thing in built.data.objects}
+    built.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    built.ops.import_scene.fbx(filepath=str(tmp_path / "a.fbx"))
+    assert {thing.type for thing in built.data.objects} == {"ARMATURE", "MESH"} and "Skin" in names & {o.name for o in built.data.objects}
