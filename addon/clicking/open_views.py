@@ -56,7 +56,7 @@ class OpenViews(bpy.types.Operator):
         if self.show != "nothing":
             setattr(context.scene.tricap_overlay, self.show, True)
         if not any(clicks.clicked_frames(clip) for clip in clips):
-            context.scene.frame_set(context.scene.tricap.seed_frame)
+            canvas.go_to_frame(context.scene, context.scene.tricap.seed_frame)
         names, switches = [clip.name for clip in clips], self.show != "nothing"
 
         def layout() -> Iterator[str]:

@@ -212,10 +212,10 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
         if self.frame < 0:
             return super().invoke(context, event)
         before, first = context.scene.frame_current, context.scene.tricap.seed_frame
-        context.scene.frame_set(self.frame)
+        canvas.go_to_frame(context.scene, self.frame)
         begun = super().invoke(context, event)
         context.scene.tricap.seed_frame = first  # so that the surface, which depends on the click frame, need not be measured again
-        context.scene.frame_set(self.frame if begun == {"RUNNING_MODAL"} else before)  # opened views show the click frame
+        canvas.go_to_frame(context.scene, self.frame if begun == {"RUNNING_MODAL"} else before)  # opened views show the click frame
         return begun
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
@@ -242,7 +242,7 @@ class GoToFrame(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Move the scene there."""
-        context.scene.frame_set(self.frame)
+        canvas.go_to_frame(context.scene, self.frame)
         return {"FINISHED"}
 
 
@@ -257,7 +257,7 @@ class ClickSeeds(ClickOperator, bpy.types.Operator):
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """Any number of seeds, in the click frame."""
         if any(clicks.clicked_frames(clip) for clip in clips.values()):
-            context.scene.frame_set(context.scene.tricap.seed_frame)
+            canvas.go_to_frame(context.scene, context.scene.tricap.seed_frame)
         return free_seed_names(clips, context.scene.frame_current)
 
     def follow(self, context: bpy.types.Context) -> None:

@@ -22,7 +22,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import sided
 from ..retarget.apply import map_of
-from ..retarget.playing import played_frames
+from ..retarget.playing import keyed_frames
 from ..retarget.read import read_motion, read_rig
 from ..scene.action import key
 from ..scene.standing import bags_of, dofs_of
@@ -47,7 +47,7 @@ def lock_feet(body: bpy.types.Object) -> str:
     remove(body)
     rig = read_rig(body)
     rig_map = map_of(rig)
-    motion = read_motion(body, rig, played_frames(bpy.context.scene))
+    motion = read_motion(body, rig, keyed_frames(body))
     leg_m = _leg_m(motion, rig_map)
     contacts = find_contacts(motion, rig_map, FeetSettings(), leg_m) if leg_m else None
     if contacts is None:

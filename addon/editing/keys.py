@@ -4,6 +4,7 @@ import bpy
 import numpy as np
 
 from ...core.foundation.errors import InputError
+from ...core.motion.plausible import check_times
 from ...core.motion.retarget.rig import needed_keys
 from ...core.motion.smoothing import smooth
 from ..scene.action import METRES_PER_RADIAN, SIMPLE_NAME, set_keys
@@ -27,6 +28,7 @@ def smooth_uncertain(body: bpy.types.Object, acceleration: float) -> str:
     if not chosen:
         raise InputError("The sigmas of this motion are not in the scene; build the rig again (step 7).")
     fps, worst = scene.render.fps / scene.render.fps_base, 0.0
+    check_times(np.arange(1), fps, "The scene plays")
     by_key = {key_of(curve): curve for curve in curves_of(edited_action(body))}
     for key, sigma_curve in chosen:
         curve = by_key[key]

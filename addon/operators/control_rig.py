@@ -34,7 +34,8 @@ class MakeControlRig(TellingOperator, bpy.types.Operator):
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         made = control_rig.make_control_rig(body_of(context))
-        return f"“{made.rig.name}” plays the motion within {made.angle_deg:.3f}° and {made.place_mm:.2f} mm."
+        off = f"{made.angle_deg:.3f}° and {made.place_mm:.2f} mm"
+        return f"“{made.rig.name}” plays the motion within {off}. The bones of the body are hidden (Alt H)."
 
 
 class SnapLimbs(TellingOperator, bpy.types.Operator):

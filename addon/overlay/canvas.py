@@ -85,6 +85,11 @@ def redraw_clips(context: bpy.types.Context, *, pictures_only: bool = False) -> 
                 (window_region(area) if pictures_only else area).tag_redraw()
 
 
+def go_to_frame(scene: bpy.types.Scene, frame: int) -> None:
+    """Show a frame, in the Clip Editors too: `frame_set` leaves these at the frame before, under overlays and clicks of the new one."""
+    scene.frame_current = frame
+
+
 def line_batch(segments: np.ndarray, colours: np.ndarray | None = None) -> gpu.types.GPUBatch:
     """A batch of separate lines: segments (N, 2, 2) and, for `draw_lines` without a colour, colours (N, 4)."""
     position = np.zeros((2 * len(segments), 3), dtype=np.float32)

@@ -25,7 +25,7 @@ from ..scene import stored
 from ..scene.armature import SNAPS_KEY
 from ..scene.standing import RIG_KEY, ROOT
 from . import metarig
-from .playing import played_frames
+from .playing import keyed_frames
 from .read import orthonormal, read_motion, read_rig, world_matrix
 from .write import push_to_strip, write_action
 
@@ -65,7 +65,7 @@ def make_control_rig(body: bpy.types.Object) -> Made:
     if rig_of(body) is not None:
         raise InputError(f"“{body.name}” has the control rig “{rig_of(body).name}” already; delete it first to make another.")
     _release(body)
-    frames = played_frames(bpy.context.scene)
+    frames = keyed_frames(body)
     motion = read_motion(body, read_rig(body), frames)
     rig = _generated(body)
     rig.matrix_world = body.matrix_world
@@ -75,7 +75,19 @@ def make_control_rig(body: bpy.types.Object) -> Made:
     _drive(body, rig)
     body[RIG_KEY] = rig
     rig[SNAPS_KEY] = _snaps(rig)
+    _put_in_place_of(body, rig)
     return Made(rig=rig, **_deviation(body, motion))
+
+
+def _put_in_place_of(body: bpy.types.Object, rig: bpy.types.Object) -> None:
+    """Show the controls next to the body in the Outliner, and hide the body's own bones, which lie over them and are no longer posed."""
+    for collection in list(rig.users_collection):
+        collection.objects.unlink(rig)
+    for collection in body.users_collection:
+        collection.objects.link(rig)
+    bpy.context.view_layer.objects.active = rig
+    rig.select_set(True)
+    body.hide_set(True)
 
 
 def rig_of(body: bpy.types.Object) -> bpy.types.Object | None:

@@ -18,10 +18,12 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.markers import Markers
 from ...core.motion.formats.ply import write_mesh
+from ...core.motion.plausible import check_span
 from ...core.motion.retarget.rig import Motion, Rig
 from ..scene import layers, stored
 from ..scene.armature import JOINTS_KEY
-from .read import read_rig, reading_motion
+from ..scene.standing import curves_of
+from .read import action_frames, check_plays, read_rig, reading_motion
 
 RIGID = "Tricap rigid"  # the modifier of the copy of a mesh whose parent is a bone
 
@@ -31,6 +33,36 @@ def played_frames(scene: bpy.types.Scene) -> range:
     if scene.use_preview_range:
         return range(scene.frame_preview_start, scene.frame_preview_end + 1)
     return range(scene.frame_start, scene.frame_end + 1)
+
+
+def exported_frames(scene: bpy.types.Scene) -> range:
+    """The frames that Blender plays.
+
+    Raises:
+        InputError: there are none, or far more than there are keys in the file.
+    """
+    frames = played_frames(scene)
+    if not frames:
+        raise InputError(f"The scene ends in frame {scene.frame_end}, before it begins; correct its frame range.")
+    keys = sum(len(curve.keyframe_points) for action in bpy.data.actions for curve in curves_of(action))
+    check_span(frames[0], frames[-1], keys, "The scene plays")
+    return frames
+
+
+def keyed_frames(armature_object: bpy.types.Object) -> range:
+    """The frames that Blender plays and in which an armature has keys.
+
+    Raises:
+        InputError: there are none.
+    """
+    played, keyed = played_frames(bpy.context.scene), action_frames(armature_object)
+    both = range(max(played.start, keyed.start), min(played.stop, keyed.stop))
+    if not both:
+        scene = f"the scene plays frames {played.start} to {played.stop - 1}"
+        raise InputError(
+            f"“{armature_object.name}” has keys in frames {keyed.start} to {keyed.stop - 1}, and {scene}; correct its frame range."
+        )
+    return both
 
 
 def reading_played(armature_object: bpy.types.Object, monitor: Monitor | None = None) -> Generator[None, None, Motion]:
@@ -43,9 +75,7 @@ def reading_played(armature_object: bpy.types.Object, monitor: Monitor | None = 
     scene = bpy.context.scene
     if armature_object.name not in scene.objects:
         raise InputError(f"The armature “{armature_object.name}” is not in this scene; choose another.")
-    frames = played_frames(scene)
-    if not frames:
-        raise InputError(f"The scene ends in frame {scene.frame_end}, before it begins; correct its frame range.")
+    frames = exported_frames(scene)
     with in_first_frame():
         rig = exported_rig(armature_object)
     return (yield from reading_motion(armature_object, rig, frames, monitor))
@@ -186,13 +216,15 @@ def writing_skins(armature_object: bpy.types.Object, folder: Path, monitor: Moni
     """Write the meshes as they are deformed in every frame that Blender plays, one PLY file and step for each frame; returns a summary.
 
     Raises:
-        InputError: there are no meshes, or a file cannot be written.
+        InputError: there are no meshes, Blender does not move one of them, or a file cannot be written.
         Cancelled: the monitor was cancelled; the files written so far stay.
     """
     scene, skins, monitor = bpy.context.scene, skins_of(armature_object), monitor or Monitor()
     if not skins:
         raise InputError(f"The armature “{armature_object.name}” deforms no mesh; bind one to it, or choose another format.")
-    frames, now = played_frames(scene), scene.frame_current
+    for thing in (armature_object, *skins):
+        check_plays(thing)
+    frames, now = exported_frames(scene), scene.frame_current
     try:
         for i, frame in enumerate(frames):
             monitor.step("writing skins", i, len(frames))

@@ -139,11 +139,27 @@ VRM = {"hips": "hips", "head": "head"} | {
 
 
 def read_pose(armature_object: bpy.types.Object, rig: Rig, frame: int) -> Motion:
-    """The pose of an armature as it stands now, also if it has no keys yet, as a motion of one frame."""
+    """The pose of an armature as it stands now, also if it has no keys yet, as a motion of one frame.
+
+    Raises:
+        InputError: Blender does not move the armature.
+    """
+    check_plays(armature_object)
     world = world_matrix(armature_object)
     matrices = np.array([armature_object.pose.bones[name].matrix for name in rig.names])
     R, head_m = orthonormal(world[:3, :3] @ matrices[:, :3, :3]), _moved(world, [*matrices[:, :3, 3]])
     return Motion(rig=rig, fps=1.0, frames=np.array([frame]), R=R[None], head_m=head_m[None])
+
+
+def check_plays(thing: bpy.types.Object) -> None:
+    """Check that Blender moves an object in the scene that is shown: what is switched off stays in an old pose.
+
+    Raises:
+        InputError: it does not.
+    """
+    if all(evaluated.original != thing for evaluated in bpy.context.evaluated_depsgraph_get().ids):
+        why = "it is in another scene, its collection is excluded or hidden, or it is disabled in viewports"
+        raise InputError(f"Blender does not play “{thing.name}”: {why}. Switch it on in the Outliner.")
 
 
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
@@ -205,8 +221,9 @@ def reading_motion(
     """`read_motion` with a step for each frame, so that the window can be drawn meanwhile.
 
     Raises:
-        InputError: a bone has no place in some frame.
+        InputError: Blender does not move the armature, or a bone has no place in some frame.
     """
+    check_plays(armature_object)
     scene = bpy.context.scene
     now, names, monitor = scene.frame_current, rig.names, monitor or Monitor()
     pose = np.empty((len(frames), len(names), 4, 4))

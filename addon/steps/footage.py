@@ -279,7 +279,7 @@ def use_rate_of(scene: bpy.types.Scene, of_images: float) -> None:
 def show_frames(scene: bpy.types.Scene) -> None:
     """Set the scene's frame range to that of the footage, and show the click frame."""
     scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
-    scene.frame_set(min(scene.tricap.seed_frame, scene.frame_end))
+    scene.frame_current = min(scene.tricap.seed_frame, scene.frame_end)  # Clip Editors follow, which `frame_set` leaves where they are
     show_all_frames(bpy.context)
 
 

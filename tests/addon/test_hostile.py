@@ -89,7 +89,7 @@ def tamper(bpy: ModuleType, value: object) -> int:
     body["tricap_control_rig"] = body["tricap_measured_motion"] = bpy.context.scene["tricap_floor_m"] = 0
     blocks = ("objects", "armatures", "collections", "scenes", "actions", "cameras", "movieclips", "workspaces")
     for thing in (thing for kind in blocks for thing in getattr(bpy.data, kind)):
-        for key in [key for key in thing.keys() if key.startswith("tricap_")]:
+        for key in [key for key in thing.keys() if key.startswith("tricap_") and key not in thing.bl_rna.properties]:
             thing[key] = value
             count += 1
     return count
@@ -116,6 +116,15 @@ def without_a_number(bpy: ModuleType) -> None:
 
 def without_armature(bpy: ModuleType) -> None:
     bpy.data.objects.remove(bpy.data.objects["Body"])
+
+
+def in_a_million_frames(bpy: ModuleType) -> None:
+    """What reads the motion frame by frame would never end."""
+    bpy.context.scene.frame_end = 1_000_000
+
+
+def at_an_absurd_rate(bpy: ModuleType) -> None:
+    bpy.context.scene.render.fps, bpy.context.scene.render.fps_base = 32767, 1e-5
 
 
 def in_edit_mode(bpy: ModuleType) -> None:
@@ -150,9 +159,12 @@ def overridden(bpy: ModuleType) -> None:
     bpy.context.scene.collection.children[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
 
 
-@pytest.mark.parametrize(
-    "spoil", [without_slot, without_a_number, without_armature, in_edit_mode, linked, linked_scene, overridden], ids=lambda f: f.__name__
-)
+SPOILT = (
+    without_slot, without_a_number, without_armature, in_a_million_frames, at_an_absurd_rate, in_edit_mode, linked, linked_scene, overridden,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("spoil", SPOILT, ids=lambda spoil: spoil.__name__)
 def test_scenes_that_somebody_changed(built: ModuleType, tmp_path: Path, spoil: Callable[[ModuleType], None]) -> None:
     spoil(built)
     every_operator(built, tmp_path / "a.bvh")
@@ -166,3 +178,25 @@ def test_a_linked_body_is_exported_with_its_skin(built: ModuleType, tmp_path: Pa
     built.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     built.ops.import_scene.fbx(filepath=str(tmp_path / "a.fbx"))
     assert {thing.type for thing in built.data.objects} == {"ARMATURE", "MESH"} and "Skin" in names & {o.name for o in built.data.objects}
+
+
+@pytest.mark.parametrize("off", ["excluded", "hidden collection", "disabled", "another scene"])
+def test_an_armature_that_is_switched_off_is_not_exported_standing_still(built: ModuleType, tmp_path: Path, off: str) -> None:
+    """Blender leaves it in its old pose, and the file would have no motion."""
+    body, layer = built.data.objects["Body"], built.context.view_layer.layer_collection.children[0]
+    for thing in [thing for thing in built.data.objects if thing != body]:  # what follows it would make Blender move it
+        built.data.objects.remove(thing)
+    if off == "excluded":
+        layer.exclude = True
+    if off == "hidden collection":
+        layer.collection.hide_viewport = True
+    body.hide_viewport = off == "disabled"
+    if off == "another scene":
+        built.context.window.scene = built.data.scenes.new("Other")
+    props = built.context.scene.tricap_retarget
+    refused(lambda: built.ops.tricap.export(kind="bvh", filepath=str(tmp_path / "a.bvh"), armature="Body"), "Body")
+    target = built.data.objects.new("Target", body.data.copy())
+    built.context.scene.collection.objects.link(target)
+    props.source, props.target = body, target
+    refused(built.ops.tricap.retarget, "does not play “Body”")
+    assert not (tmp_path / "a.bvh").exists() and target.animation_data is None

@@ -117,7 +117,9 @@ def a_keyframe(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
 def watched() -> drive.Steps:
     """Every overlay is drawn; pointing at the sleeve tells what is known there."""
     scene = bpy.context.scene
-    scene.frame_set(2)
+    bpy.ops.tricap.go_to_frame(frame=2)
+    yield from drive.settle(10)
+    drive.check({area.spaces.active.clip_user.frame_current for area in views().values()} == {2}, "that of the overlays")
     shown = scene.tricap_overlay
     yield from drive.settle()
     plain = display.pixels()
