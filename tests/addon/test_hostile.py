@@ -160,7 +160,8 @@ def overridden(bpy: ModuleType) -> None:
 
 
 SPOILT = (
-    without_slot, without_a_number, without_armature, in_a_million_frames, at_an_absurd_rate, in_edit_mode, linked, linked_scene, overridden,
+    without_slot, without_a_number, without_armature, in_a_million_frames,
+    at_an_absurd_rate, in_edit_mode, linked, linked_scene, overridden,
 )  # fmt: skip
 
 
