@@ -18,6 +18,7 @@ from .footage import Footage
 from .sources import PERSON_SOURCES, read_picture
 
 WHITE = 127.0  # grey values; brighter pixels of a mask are the person
+PATTERN_PX, PATTERN = 3, 0.05  # so much of a mask is white, and nowhere in a square of that side: a pattern, or noise of a film's coding
 HOLE_PX = 15  # px, side of the largest hole that is closed in a silhouette, where the person has the background's grey value
 
 
@@ -53,12 +54,15 @@ def check_mask(picture: np.ndarray, path: Path, *, of_all: bool) -> None:
     """Refuse a mask (h, w) with a person who is not white. `of_all`: it is for all images, so that somebody is in it.
 
     Raises:
-        InputError: it is neither black nor white anywhere, or black everywhere for all images.
+        InputError: it is neither black nor white anywhere, black everywhere for all images, or a pattern of single pixels.
     """
     if of_all and not picture.any():
         raise InputError(f"The mask {path} is black everywhere; paint white wherever the person comes, or remove `mask` from take.toml.")
     if 0 < picture.max() <= WHITE:
         raise InputError(f"The mask {path} is nowhere brighter than {picture.max():.0f} of 255; paint the person white.")
+    white = (picture > WHITE).astype(np.uint8)
+    if white.mean() > PATTERN and not cv2.erode(white, np.ones((PATTERN_PX, PATTERN_PX), np.uint8)).any():
+        raise InputError(f"The mask {path} is a pattern of single white pixels, in which nothing can be matched; paint the person white.")
 
 
 def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:

@@ -73,6 +73,13 @@ def black(take: Path) -> None:
     view(take, 'mask = "m.png"')
 
 
+def checkerboard(take: Path) -> None:
+    """Half of it is white, and nothing can be matched in it."""
+    board = (255 * (np.indices((150, 200)).sum(axis=0) % 2)).astype(np.uint8)
+    (take / "m.png").write_bytes(cv2.imencode(".png", board)[1].tobytes())
+    view(take, 'mask = "m.png"')
+
+
 def another_room(take: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (150, 200), dtype=np.uint8)
     (take / "b.png").write_bytes(cv2.imencode(".png", noise)[1].tobytes())
@@ -85,6 +92,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "too few masks": (lambda take: masks(take, 2), "has 2 masks, but none for frame 2"),
     "a grey mask": (not_white, "nowhere brighter than 100"),
     "a black mask": (black, "m.png is black everywhere"),
+    "a checkerboard as a mask": (checkerboard, "pattern of single white pixels"),
     "a text as a mask": (text_instead, "not a readable image"),
     "a small mask": (of_another_size, "has 20×20 pixels"),
     "no mask": (lambda take: view(take, 'mask = "m.png"'), "Cannot read the image"),
