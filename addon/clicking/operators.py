@@ -20,6 +20,7 @@ from .click_session import ClickSession, free_seed_names, joints_of, needed_firs
 from .finder import Finder
 
 TICK_S, SNAP_PX = 0.05, 6.0
+LAST_FRAME = 1_048_574  # of a scene; Blender crashes at some numbers beyond
 NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
 KEYS = "Click: set    Return: accept proposals    S / right click: skip    Backspace: undo    Tab, 1…9: view    Esc: finish"
 
@@ -238,7 +239,7 @@ class GoToFrame(bpy.types.Operator):
     bl_label = "Go to Frame"
     bl_options = {"REGISTER", "UNDO"}
 
-    frame: bpy.props.IntProperty(name="Frame", description="Number of the frame")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(name="Frame", min=0, max=LAST_FRAME, description="Number of the frame")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Move the scene there."""

@@ -201,3 +201,10 @@ def test_an_armature_that_is_switched_off_is_not_exported_standing_still(built: 
     props.source, props.target = body, target
     refused(built.ops.tricap.retarget, "does not play “Body”")
     assert not (tmp_path / "a.bvh").exists() and target.animation_data is None
+
+
+def test_a_frame_beyond_all_frames(built: ModuleType) -> None:
+    """Blender 5.2 crashed, where an object had a scale that is no number."""
+    built.data.objects["Body"].scale = (float("nan"),) * 3
+    assert built.ops.tricap.go_to_frame(frame=2**31 - 1) == {"FINISHED"}
+    assert built.context.scene.frame_current == 1_048_574
