@@ -65,6 +65,8 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     target = properties.target_of(context.scene)
     if target is not None and props.target is None:
         sentence(layout, context, f"“{target.name}” is the target, as the only other armature.", "INFO")
+    if target is None:
+        sentence(layout, context, "Add your character to this scene, and choose its armature as the target.", "INFO")
     header, body = layout.panel("tricap_retarget_map", default_closed=not props.rows)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (automatic)")
     if body is not None:

@@ -115,6 +115,10 @@ def test_the_editor_is_drawn(blender: ModuleType, props: Any, tmp_path: Path) ->
     assert [layout.properties.count("twist") for layout in (empty, drawn())] == [1, 2], "the setting alone; and that of the selected line"
     props.target, props.source, props.file = props.source, None, str(tmp_path / "a.trc")
     assert "that of “Target”" in " ".join(drawn().texts) and {"up", "unit"} <= set(drawn().properties)
+    assert "choose its armature as the target" not in " ".join(drawn().texts)
+    for thing in [thing for thing in blender.data.objects if thing.type == "ARMATURE"]:
+        blender.data.objects.remove(thing)
+    assert "choose its armature as the target" in " ".join(drawn().texts), "why Retarget is grey"
 
 
 def test_a_preview_can_be_ended_while_there_is_one(blender: ModuleType, props: Any) -> None:
