@@ -124,7 +124,12 @@ class SmallRun:
 @pytest.fixture
 def small_run(tmp_path: Path) -> SmallRun:
     """A take of eight images a view, of which frames 2…7 were run, and the results of that run."""
-    take, out = tmp_path / "swing", tmp_path / "out"
+    return make_small_run(tmp_path)
+
+
+def make_small_run(folder: Path) -> SmallRun:
+    """The same in a folder."""
+    take, out = folder / "swing", folder / "out"
     rig = small_rig()
     write_take(take, rig)
     shape, motion, sigma = arm()

@@ -36,6 +36,7 @@ def test_the_controls_play_the_motion_and_limbs_snap(blender: ModuleType, tmp_pa
         wanted.append(pose(body))
     assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
     rig = blender.data.objects["Body controls"]
+    assert rig.users_collection == body.users_collection and blender.context.active_object == rig and not body.visible_get()
     assert {"upper_arm_fk.L", "hand_ik.R", "foot_ik.L", "pelvis", "root"} <= set(rig.pose.bones.keys())
     data = rig.animation_data
     assert len(data.nla_tracks) == 1 and data.nla_tracks[0].lock and data.action.name == "Corrections" and not data.action.layers

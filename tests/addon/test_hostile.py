@@ -8,17 +8,36 @@ from types import ModuleType
 
 import pytest
 
-from .conftest import SmallRun
+from .conftest import SmallRun, make_small_run
 from .test_wrong_moves import ADDON, refused
 
 EXPORTED = ("bvh", "c3d", "trc", "csv", "mot", "fbx", "glb", "usd", "abc")
 
 
-@pytest.fixture
-def built(blender: ModuleType, small_run: SmallRun) -> ModuleType:
-    """bpy with the scene of a small run."""
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> SmallRun:
+    """One for all tests, which only read it."""
+    return make_small_run(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="module")
+def file(blender: ModuleType, small_run: SmallRun) -> Path:
+    """A file with its scene."""
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert blender.ops.tricap.build_scene(out=str(small_run.out)) == {"FINISHED"}
+    built = small_run.out.with_name("built.blend")
+    blender.ops.wm.save_as_mainfile(filepath=str(built), copy=True)
+    return built
+
+
+@pytest.fixture
+def built(blender: ModuleType, file: Path) -> ModuleType:
+    """bpy with that scene, in a file that was never saved."""
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with blender.data.libraries.load(str(file)) as (there, here):
+        here.scenes = there.scenes
+    former, blender.context.window.scene = blender.context.scene, here.scenes[0]
+    blender.data.scenes.remove(former)
     return blender
 
 
