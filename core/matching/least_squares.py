@@ -55,6 +55,7 @@ REST_SIGMAS = 0.1  # of the point's sigma, rest after the last step that is acce
 REST_PX = 0.005  # px, the same, where it is more
 GRADIENT_NOISE = 0.45  # of (6)
 CURVATURE_RATE = 0.1  # smallest λ of (6)
+GIVE_UP = ((5, 0.15), (9, 0.05))  # iterations after which a patch is given up whose correlation is so much below the smallest
 LINEAR_PX = 0.25  # px by which any part of the patch may move for (6) to apply
 SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled for the reported sigma0
 INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
@@ -161,15 +162,23 @@ class SearchImage:
 
 
 def match_patches(
-    template: TemplatePoints, searches: Sequence[SearchImage], settings: MatchingSettings, *, monitor: Monitor | None = None
+    template: TemplatePoints,
+    searches: Sequence[SearchImage],
+    settings: MatchingSettings,
+    *,
+    needed: int = 0,
+    monitor: Monitor | None = None,
 ) -> list[Matches]:
-    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image."""
+    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image.
+
+    A point that fewer than `needed` images can still match is given up; it is NOT_CONVERGED in the others.
+    """
     n = len(template.xy)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches])
+        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches], needed)
 
     parts = in_threads(work, _pieces(n))
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
@@ -247,29 +256,32 @@ class PatchTemplates:
         mean, q = mean.astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
-    def find(self, searches: Sequence[SearchImage]) -> list[Matches]:
+    def find(self, searches: Sequence[SearchImage], needed: int = 0) -> list[Matches]:
         """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
         N, transferred = len(self.inside), self._transferred()
         start, shape = (
             np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images])
             for of_images in ([search.start for search in searches], [search.shape for search in searches])
         )
-        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches))
+        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches), needed)
         spans = [slice(k * N, (k + 1) * N) for k in range(len(searches))]
         return [
             self._judge(SearchImage(image=search.image, start=start[r], shape=shape[r]), settled.select(r), transferred)
             for search, r in zip(searches, spans)
         ]
 
-    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> "_Settled":
+    def _settled(
+        self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray, needed: int = 0
+    ) -> "_Settled":
         """The results of (2) and (3) for the patches that begin as NOT_CONVERGED."""
-        most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
+        s = self._settings
         c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
-        alive = status == MatchStatus.NOT_CONVERGED
+        chances = _Chances(status, len(self.inside), needed)
+        alive = (status == MatchStatus.NOT_CONVERGED) & chances.left(np.arange(len(start)))
         harmless = _starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
         place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, harmless), np.where(alive[:, None, None], A, np.eye(2))
         work = _AtWork(self, images, place)
-        for iteration in range(1, most + 1):
+        for iteration in range(1, s.max_iterations + 1):
             if not alive.any():
                 break
             if np.count_nonzero(alive) < COMPACT_BELOW * len(alive):
@@ -277,14 +289,20 @@ class PatchTemplates:
                 work = _AtWork(self, images, place)
             step, rho, gain = work.step(at, warp)
             at, warp, moved = compose(at, warp, step)
-            lost = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
+            lost = (largest(at - start[place]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            lost |= largest((warp - shape[place]).reshape(-1, 4)) > 2 * s.max_shear
             near, spared = self._converged(step, moved, work.sigma(rho))
-            finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
-            here = place[finished]
+            found = alive & (near | spared) & ~lost
+            low = alive & ~found & (rho < s.min_correlation - _shortfall(iteration))
             rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
+            failed = alive & (lost | low | (found & (rho < s.min_correlation)) | ((iteration == s.max_iterations) & ~found))
+            chances.lose(place[failed])
+            finished = np.flatnonzero(alive & (found | failed | ~chances.left(place)))
+            here = place[finished]
             c[here], A[here], correlation[here], iterations[here] = at[finished], warp[finished], rho[finished], iteration
-            status[here] = np.where((near | spared)[finished], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
+            status[place[found]] = MatchStatus.OK
             status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
+            status[place[low & ~lost]] = MatchStatus.LOW_CORRELATION
             alive[finished] = False
             at[lost], warp[lost] = harmless[place[lost]], np.eye(2)
         return _Settled(c=c, A=A, status=status, correlation=correlation, iterations=iterations)
@@ -359,6 +377,28 @@ class _Settled:
     def select(self, rows: slice) -> "_Settled":
         """Only these patches."""
         return _Settled(**{f.name: getattr(self, f.name)[rows] for f in fields(_Settled)})
+
+
+class _Chances:
+    """In how many images each of N points can still be matched, of rows image after image; below `needed` it is given up."""
+
+    def __init__(self, status: np.ndarray, points: int, needed: int) -> None:
+        self._points, self._needed = points, needed
+        self._open = (status.reshape(-1, points) == MatchStatus.NOT_CONVERGED).sum(axis=0) if points else np.zeros(0, dtype=np.int64)
+
+    def lose(self, rows: np.ndarray) -> None:
+        """These rows failed."""
+        if self._needed:
+            np.subtract.at(self._open, rows % self._points, 1)
+
+    def left(self, rows: np.ndarray) -> np.ndarray:
+        """Whether the points of these rows can still be matched in as many images as are needed."""
+        return np.asarray(self._open[rows % max(1, self._points)] >= self._needed)
+
+
+def _shortfall(iteration: int) -> float:
+    """By how much the correlation may be below the smallest one at an iteration."""
+    return min((below for since, below in GIVE_UP if iteration >= since), default=np.inf)
 
 
 def _starts_at_work(start: np.ndarray, alive: np.ndarray, images: int) -> np.ndarray:

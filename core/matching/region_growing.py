@@ -384,7 +384,8 @@ def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSetti
     """Match a front's points `xy` (n, 2) in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     template = TemplatePoints(image=views.template, xy=xy, row_step=views.rows.step)
     searches = [SearchImage(image=views.images[k], start=front.start[:, k], shape=front.shape[:, k]) for k in views.search]
-    matched = match_patches(template, searches, matching)
+    required = views.required_matches(pairs)
+    matched = match_patches(template, searches, matching, needed=required)
     image_xy = np.full((len(xy), len(views.cameras), 2), np.nan)
     rig = np.diag([1.0, 1 / views.rows.step**2]) * rig_sigma_px**2
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(views.cameras), 1, 1))
@@ -392,7 +393,7 @@ def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSetti
     for k, m in zip(views.search, matched):
         image_xy[m.ok, k] = m.transfer_xy[m.ok]
         K[m.ok, k] = m.transfer_covariance[m.ok] + rig
-    image_xy[~_enough(matched, views.required_matches(pairs))] = np.nan
+    image_xy[~_enough(matched, required)] = np.nan
     point = forward_intersection(views.cameras, views.rows.to_frame(image_xy), views.rows.covariance_to_frame(K))
     return _Measured(matched=matched, point=point, depth_m=views.base.to_camera(point.xyz_m)[:, 2])
 
