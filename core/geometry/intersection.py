@@ -14,7 +14,7 @@ from .camera import Camera
 from .small_matrices import invert_spd
 
 STEPS = 4  # of (2), at most
-CONVERGED_M = 1e-7  # step
+CONVERGED_M = 1e-6  # step; the next one would be a thousandth of it
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
 MOST_MISS_SIGMAS = 3.0  # of the clicks, their root mean square; by chance one in 45 000 (two views) or 170 000 (three) misses by more
 
@@ -41,33 +41,28 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
 
     `xy_px` (N, K, 2) full-frame pixels, NaN where a point is not visible; `covariance_px2` (N, K, 2, 2).
     """
-    n = len(xy_px)
     visible = np.isfinite(xy_px).all(axis=2)
     rays = visible.sum(axis=1)
-    P = np.zeros((n, len(cameras), 2, 2))
-    P[visible] = invert_spd(covariance_px2[visible])
-    X = np.full((n, 3), np.nan)
-    good = rays >= 2
-    X[good] = _closest_points(cameras, xy_px[good], visible[good])
+    good = np.flatnonzero(rays >= 2)
+    n, xy, seen = len(xy_px), xy_px[good], visible[good]
+    P = np.zeros((len(good), len(cameras), 2, 2))
+    P[seen] = invert_spd(covariance_px2[good][seen])
+    X = _closest_points(cameras, xy, seen)
     for _ in range(STEPS):
-        N, rhs, _ = _normal_equations(cameras, X, xy_px, P, visible)
+        N, rhs, _ = _normal_equations(cameras, X, xy, P, seen)
         step = _solve(N, rhs)
         X += step
         if np.nanmax(np.abs(step), initial=0.0) < CONVERGED_M:
             break
-    N, _, v = _normal_equations(cameras, X, xy_px, P, visible)
-    K = np.full((n, 3, 3), np.nan)
-    usable = np.isfinite(N).all(axis=(1, 2)) & good
-    K[usable] = invert_spd(N[usable] + np.eye(3) * 1e-9)
-    X[~usable] = np.nan
+    N, _, v = _normal_equations(cameras, X, xy, P, seen)
+    usable = np.isfinite(N).all(axis=(1, 2))
     vPv = np.einsum("nki,nkij,nkj->n", np.nan_to_num(v), P, np.nan_to_num(v))
-    return Intersection(
-        xyz_m=X,
-        covariance_m2=K,
-        residual_px=np.where(usable[:, None, None], v, np.nan),
-        sigma0=np.where(usable, np.sqrt(vPv / np.maximum(2 * rays - 3, 1)), np.nan),
-        rays=rays,
-    )
+    xyz, K, residual, sigma0 = (np.full((n, *shape), np.nan) for shape in ((3,), (3, 3), xy_px.shape[1:], ()))
+    rows = good[usable]
+    xyz[rows], residual[rows] = X[usable], v[usable]
+    K[rows] = invert_spd(N[usable] + np.eye(3) * 1e-9)
+    sigma0[rows] = np.sqrt(vPv[usable] / np.maximum(2 * rays[rows] - 3, 1))
+    return Intersection(xyz_m=xyz, covariance_m2=K, residual_px=residual, sigma0=sigma0, rays=rays)
 
 
 def intersect_clicks(cameras: Sequence[Camera], xy_px: np.ndarray, sigma_px: float | np.ndarray = CLICK_SIGMA_PX) -> Intersection:

@@ -82,19 +82,19 @@ def sweep_seeds(
     *,
     spacing_px: int,
     depth_range_m: tuple[float, float] | None,
-    within_px: tuple[np.ndarray, np.ndarray] | None = None,
+    near_px: tuple[np.ndarray, np.ndarray] | None = None,
     monitor: Monitor,
     pairs: bool = False,
 ) -> Approximations:
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
-    `within_px`, a corner (2,) and the opposite one in rows' pixels, only cells in this box are searched. With `pairs`, one search view is
+    `near_px`, places (N, 2) and a distance (2,) in rows' pixels, only cells about these places are searched. With `pairs`, one search view is
     enough.
     """
     xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
-    if within_px is not None:
-        xy = xy[((xy >= within_px[0]) & (xy <= within_px[1])).all(axis=1)]
+    if near_px is not None:
+        xy = xy[(np.abs(xy[:, None] - near_px[0]) <= near_px[1]).all(axis=2).any(axis=1)]
     xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
     near, far = depth_range_m or _default_range(views)
