@@ -89,8 +89,8 @@ def sweep_seeds(
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
-    `near_px`, places (N, 2) and a distance (2,) in rows' pixels, only cells about these places are searched. With `pairs`, one search view is
-    enough.
+    `near_px`, places (N, 2) and a distance (2,) in rows' pixels, only cells about these places are searched. With `pairs`, one search view
+    is enough.
     """
     xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
     if near_px is not None:
