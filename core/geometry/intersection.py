@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .camera import Camera
+from .camera import Camera, project_all
 from .small_matrices import invert_spd
 
 STEPS = 4  # of (2), at most
+START_STEPS = 2  # of the rays from which (2) starts: within 10⁻⁶ of their directions
 CONVERGED_M = 1e-6  # step; the next one would be a thousandth of it
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
 MOST_MISS_SIGMAS = 3.0  # of the clicks, their root mean square; by chance one in 45 000 (two views) or 170 000 (three) misses by more
@@ -87,10 +88,10 @@ def doubtful_view(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:
 
 
 def _closest_points(cameras: Sequence[Camera], xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """The points closest to the rays (N, 3): Σ (I − d dᵀ)(X − C) = 0."""
+    """The points closest to the rays (N, 3), approximately: Σ (I − d dᵀ)(X − C) = 0."""
     A, b = np.zeros((len(xy), 3, 3)), np.zeros((len(xy), 3))
     for k, camera in enumerate(cameras):
-        d = camera.rays(np.where(visible[:, k, None], xy[:, k], 0.0))
+        d = camera.rays(np.where(visible[:, k, None], xy[:, k], 0.0), START_STEPS)
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * visible[:, k, None, None]
         A += across
@@ -101,14 +102,14 @@ def _closest_points(cameras: Sequence[Camera], xy: np.ndarray, visible: np.ndarr
 def _normal_equations(
     cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray, visible: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    N, rhs, v = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3)), np.full(xy.shape, np.nan)
-    for k, camera in enumerate(cameras):
-        image, J = camera.project_with_jacobian(X)
-        v[:, k] = np.where(visible[:, k, None], xy[:, k] - image, np.nan)
-        JP = np.where(visible[:, k, None, None], J.transpose(0, 2, 1) @ P[:, k], 0.0)
-        N += JP @ np.where(visible[:, k, None, None], J, 0.0)
-        rhs += np.einsum("nij,nj->ni", JP, np.where(visible[:, k, None], v[:, k], 0.0))
-    return N, rhs, v  # (2)
+    image, J = project_all(cameras, X)
+    there = visible.T
+    v = np.where(there[..., None], xy.transpose(1, 0, 2) - image, np.nan)
+    J = np.where(there[..., None, None], J, 0.0)
+    JP = np.where(there[..., None, None], P.transpose(1, 0, 2, 3) @ J, 0.0)
+    N = np.einsum("knia,knib->nab", JP, J)
+    rhs = np.einsum("knia,kni->na", JP, np.where(there[..., None], v, 0.0))
+    return N, rhs, v.transpose(1, 0, 2)  # (2)
 
 
 def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:

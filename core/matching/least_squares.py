@@ -123,6 +123,10 @@ class Matches:
     parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture does not determine the shape
     status: np.ndarray  # (N,) MatchStatus
 
+    def select(self, rows: slice) -> "Matches":
+        """Only these patches."""
+        return Matches(**{name: getattr(self, name)[rows] for name in Matches.__dataclass_fields__})
+
     @property
     def transfer_xy(self) -> np.ndarray:
         """(N, 2) position of the texture's centre of gravity, x_o of (5)."""
