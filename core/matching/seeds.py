@@ -94,7 +94,7 @@ def sweep_seeds(
     """
     xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
     if near_px is not None:
-        xy = xy[(np.abs(xy[:, None] - near_px[0]) <= near_px[1]).all(axis=2).any(axis=1)]
+        xy = xy[_near(xy, *near_px)]
     xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
     near, far = depth_range_m or _default_range(views)
@@ -111,6 +111,14 @@ def sweep_seeds(
     parts = in_threads(work, equal_pieces(len(xy), block, 2))
     depth, good = (np.concatenate(a) for a in zip(*parts))
     return approximations_at_depth(views.cameras, views.reference, views.rows, xy[good], depth[good])
+
+
+def _near(xy: np.ndarray, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(N,) which points (N, 2) lie within a distance (2,) of any of the places (M, 2), in both directions."""
+    from scipy.spatial import cKDTree
+
+    nearest, _ = cKDTree(places / distance).query(xy / distance, p=np.inf, distance_upper_bound=1.0)
+    return np.isfinite(nearest)
 
 
 def sweep_ray(views: Views, xy: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None = None) -> float | None:

@@ -274,7 +274,7 @@ def match_spatially(
     template = TemplatePoints(image=images[ref], xy=at[ref], row_step=view.rows.step, texture_centre=False)
     starts = [np.where(good[:, [k]], at[k], np.nan) for k in view.others]
     searches = [SearchImage(image=images[k], start=start, shape=points.shape[:, k]) for k, start in zip(view.others, starts)]
-    spatial = match_patches(template, searches, view.matching, needed=min(3, len(view.cameras)) - 1)
+    spatial = match_patches(template, searches, view.matching)
     for k, s in zip(view.others, spatial):
         mark(status[:, k], ~s.ok, TrackStatus.NOT_VERIFIED)
     return spatial
