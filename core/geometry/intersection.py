@@ -14,6 +14,7 @@ from .camera import Camera, project_all
 from .small_matrices import invert_spd
 
 STEPS = 4  # of (2), at most
+RAY_TEST = 0.999  # probability of the χ² test of rays
 START_STEPS = 2  # of the rays from which (2) starts: within 10⁻⁶ of their directions
 CONVERGED_M = 1e-6  # step; the next one would be a thousandth of it
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
@@ -64,6 +65,14 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
     K[rows] = invert_spd(N[usable] + np.eye(3) * 1e-9)
     sigma0[rows] = np.sqrt(vPv[usable] / np.maximum(2 * rays[rows] - 3, 1))
     return Intersection(xyz_m=xyz, covariance_m2=K, residual_px=residual, sigma0=sigma0, rays=rays)
+
+
+def chi2_limit(rays: np.ndarray) -> np.ndarray:
+    """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
+    from scipy.special import gammaincinv
+
+    redundant = np.maximum(2 * rays - 3, 1)
+    return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
 def intersect_clicks(cameras: Sequence[Camera], xy_px: np.ndarray, sigma_px: float | np.ndarray = CLICK_SIGMA_PX) -> Intersection:

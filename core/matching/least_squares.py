@@ -61,8 +61,9 @@ SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled fo
 INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
 TEXTURED_RMS = 0.5  # grey values, smallest RMS contrast of a patch
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # a 3×3 matrix from its upper part
-PER_PATCH = ("f", "fx", "fy", "q", "inside", "contrast", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # arrays
-JUDGED = PER_PATCH[5:]  # those that the judgement of a match needs
+OF_PIXELS = ("f", "fx", "fy")  # arrays of each patch's pixels, and
+JUDGED = ("q", "inside", "contrast", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # of each patch
+PER_PATCH = (*OF_PIXELS, *JUDGED)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

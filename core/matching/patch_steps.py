@@ -5,10 +5,12 @@ from typing import Protocol
 
 import numpy as np
 
+from ..foundation.threads import in_threads
 from ..images.sampling import SplineImage
 from .parameter_sets import PARAMETERS
 from .patches import compare
 
+SHARED_FROM = 1026  # patches from which on threads share the images
 MAX_STEP_PX = 2.0  # px, longer steps are shortened
 MIN_DETERMINANT = 0.1  # of I + B; a smaller one has no usable inverse
 
@@ -44,7 +46,12 @@ class PatchSteps:
 
     def step(self, c: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Δp of (2) (m, 6), the correlation ρ (m,) before it, and the step's gain in ρ² where it is small enough to be linear."""
-        found = [compare(image, c[rows], A[rows], self._half, patches) for image, rows, patches in self._views]
+
+        def compared(of_image: tuple[SplineImage, slice, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
+            image, rows, patches = of_image
+            return compare(image, c[rows], A[rows], self._half, patches)
+
+        found = in_threads(compared, self._views) if len(c) >= SHARED_FROM else [*map(compared, self._views)]
         power, along, pulled = found[0] if len(found) == 1 else (np.concatenate(parts) for parts in zip(*found))
         gain = self._contrast * along / power  # r1
         rhs = ((pulled - self._q * along[:, None]) * gain[:, None]).astype(np.float64)

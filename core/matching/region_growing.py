@@ -1,9 +1,8 @@
 """Region growing: dense matching from seeds, whole fronts of points at a time.
 
 As published (D'Apuzzo et al. 2000, §2.2) the reference image is the template, a point's start is its matched neighbour shifted with the
-neighbour's shape, and failed points are tried again from other neighbours. Here the neighbours of the points that were just accepted join
-the array of patches at work, and a point is accepted only if enough views match it, its rays meet, and its depth continues that of its
-neighbour:
+neighbour's shape, and failed points are tried again from other neighbours. Here the neighbours of accepted points join the patches at work,
+and a point is accepted only if enough views match it, its rays meet, and its depth continues that of its neighbour:
 
     start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
 """
@@ -18,7 +17,7 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
 from ..geometry.camera import Camera
-from ..geometry.intersection import Intersection, forward_intersection
+from ..geometry.intersection import Intersection, chi2_limit, forward_intersection
 from .foreground import Foreground
 from .least_squares import Matches, Matching, MatchingSettings, PatchTemplates, SearchImage, TemplatePoints, match_patches
 from .seeds import Approximations
@@ -30,7 +29,6 @@ NOISE_SIGMAS = 4.0  # sigmas of a depth by which it may differ from its parent's
 EQUAL_SIGMA_PX = 1.0  # px, far above matching's own: all rays have the same weight
 PATCH_STEP_PX = 4  # px by which the patch grows from round to round
 SMOOTHED_FROM_LEVEL = 2  # rounds of larger patches, from which on the images are smoothed
-RAY_TEST = 0.999  # probability of the χ² test of rays
 AT_WORK = 0.5  # share of the patches at work with which the next front begins
 NARROW = -1  # level of the last round: fingers, and what shows next to an outline, are narrower than the patch
 SMALLEST_PATCH_PX = 5  # px, side of a patch
@@ -180,8 +178,7 @@ class _Cells:
         self.residual[cell], self.sigma0[cell] = point.rms_residual_px, point.sigma0
 
     def next_front(self, fresh: np.ndarray, failed: np.ndarray, attempts: int, base: Camera) -> "Front":
-        """The open neighbours of freshly accepted cells, and failed cells that have a new neighbour, with the predictions (1) of their
-        parents."""
+        """The open neighbours of freshly accepted cells, and failed cells with a new neighbour: the predictions (1) of these parents."""
         cell, parent = self._to_try(fresh, failed, attempts)
         step = self.grid.xy(cell) - self.grid.xy(parent)
         start = self.centre[parent] + np.einsum("nkij,nj->nki", self.shape[parent], step)  # (1)
@@ -443,14 +440,6 @@ def _intersected(views: Views, xy: np.ndarray, matched: list[Matches], rig_sigma
 def _enough(matched: Sequence[Matches], required: int) -> np.ndarray:
     """(N,) whether as many views match the point as are required."""
     return np.asarray(np.sum([m.ok for m in matched], axis=0) >= required)
-
-
-def chi2_limit(rays: np.ndarray) -> np.ndarray:
-    """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
-    from scipy.special import gammaincinv
-
-    redundant = np.maximum(2 * rays - 3, 1)
-    return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
 PerPoint = TypeVar("PerPoint", Matches, Intersection)
