@@ -22,6 +22,7 @@ projection centre followed by a shift δ,
 The interior unknowns are those of Brown (1971) with affinity and shear, in the order of `INTERIOR`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -83,13 +84,14 @@ class Camera:
         """Pixels (…, 2) and their derivative to the world point (…, 2, 3), analytic."""
         p = _ahead(self.to_camera(xyz_m))
         a, b, inverse_z = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2], 1 / p[..., 2]
-        zero = np.zeros_like(a)
-        to_ab = np.stack([inverse_z, zero, -a * inverse_z, zero, inverse_z, -b * inverse_z], -1).reshape(*a.shape, 2, 3)
-        jacobian = self._pixel_matrix() @ self._distortion_jacobian(a, b) @ to_ab @ self.R_cam_world
+        jacobian = _pixel_jacobian(self._pixel_matrix(), a, b, inverse_z, self._distortion_derivatives(a, b)) @ self.R_cam_world
         return self._image(p), jacobian
 
-    def directions(self, xy_px: np.ndarray) -> np.ndarray:
-        """Rays in the camera's frame (…, 3) with z = 1, the inverse of (2)–(5) by Newton's method; not finite where there is none."""
+    def directions(self, xy_px: np.ndarray, steps: int = UNDISTORT_STEPS) -> np.ndarray:
+        """Rays in the camera's frame (…, 3) with z = 1, the inverse of (2)–(5) by Newton's method; not finite where there is none.
+
+        Fewer `steps` than by default give approximate rays.
+        """
         xy = np.asarray(xy_px, dtype=np.float64)
         inverse = np.linalg.inv(self._pixel_matrix())
         target = (xy - self.matrix[:2, 2]) @ inverse.T
@@ -99,7 +101,7 @@ class Camera:
             return np.concatenate([target * np.where(d > 0, stretch, 1.0)[..., None], np.ones_like(target[..., :1])], axis=-1)
         a, b = target[..., 0], target[..., 1]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(UNDISTORT_STEPS):
+            for _ in range(steps):
                 residual = self._distort(a, b) - target
                 u, v = residual[..., 0], residual[..., 1]
                 aa, cross, bb = self._distortion_derivatives(a, b)
@@ -117,9 +119,9 @@ class Camera:
         radius = np.linalg.norm(corners[:, :2], axis=1)
         return float(np.where(np.isfinite(radius), radius, lens.FARTHEST).max() if self.fisheye else radius.max())
 
-    def rays(self, xy_px: np.ndarray) -> np.ndarray:
-        """Ray directions in the world (…, 3), scaled so that depth z_cam = 1 per unit."""
-        return self.directions(xy_px) @ self.R_cam_world
+    def rays(self, xy_px: np.ndarray, steps: int = UNDISTORT_STEPS) -> np.ndarray:
+        """Ray directions in the world (…, 3), scaled so that depth z_cam = 1 per unit; `steps` as in `directions`."""
+        return self.directions(xy_px, steps) @ self.R_cam_world
 
     def points_at_depth(self, xy_px: np.ndarray, depth_m: np.ndarray | float) -> np.ndarray:
         """World points (…, 3) on the rays of the pixels at depth z_cam [m]."""
@@ -147,26 +149,62 @@ class Camera:
     def _distort(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         if self.fisheye:
             return np.stack([a, b], axis=-1) * lens.scale(self.distortions[:4], a, b)[0][..., None]
-        k1, k2, p1, p2, k3 = self.distortions
-        r2 = a * a + b * b
-        L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))  # (3)
-        return np.stack([a * L + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * L + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b], axis=-1)  # (4)
-
-    def _distortion_jacobian(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        aa, cross, bb = self._distortion_derivatives(a, b)
-        return np.stack([aa, cross, cross, bb], axis=-1).reshape(*a.shape, 2, 2)
+        return np.stack(_brown(self.distortions, a, b), axis=-1)
 
     def _distortion_derivatives(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """∂a'/∂a, ∂a'/∂b = ∂b'/∂a and ∂b'/∂b."""
         if self.fisheye:
             S, Q, _ = lens.scale(self.distortions[:4], a, b)
             return S + a * a * Q, a * b * Q, S + b * b * Q
-        k1, k2, p1, p2, k3 = self.distortions
-        r2 = a * a + b * b
-        L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        dL = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # dL/da = a dL, dL/db = b dL
-        cross = a * b * dL + 2 * p1 * a + 2 * p2 * b
-        return L + a * a * dL + 2 * p1 * b + 6 * p2 * a, cross, L + b * b * dL + 6 * p1 * b + 2 * p2 * a
+        return _brown_derivatives(self.distortions, a, b)
+
+
+def project_all(cameras: Sequence[Camera], xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (K, N, 2) of world points (N, 3) in K cameras, and their derivatives to the points (K, N, 2, 3), as
+    `Camera.project_with_jacobian`, all cameras at once unless one has a fisheye lens."""
+    if any(camera.fisheye for camera in cameras):
+        found = [camera.project_with_jacobian(xyz_m) for camera in cameras]
+        return np.stack([x for x, _ in found]), np.stack([J for _, J in found])
+    R = np.stack([camera.R_cam_world for camera in cameras])
+    p = _ahead(np.asarray(xyz_m, dtype=np.float64) @ R.transpose(0, 2, 1) + np.stack([c.t_cam_world_m for c in cameras])[:, None])
+    inverse_z = 1 / p[..., 2]
+    a, b = p[..., 0] * inverse_z, p[..., 1] * inverse_z
+    distortions = np.stack([camera.distortions for camera in cameras], axis=1)[..., None]  # (5, K, 1)
+    pixels = np.stack([camera._pixel_matrix() for camera in cameras])
+    centre = np.stack([camera.matrix[:2, 2] for camera in cameras])[:, None]
+    xy = np.stack(_brown(distortions, a, b), axis=-1) @ pixels.transpose(0, 2, 1) + centre
+    elements = np.moveaxis(pixels, 0, -1)[..., None]  # (2, 2, K, 1)
+    return xy, _pixel_jacobian(elements, a, b, inverse_z, _brown_derivatives(distortions, a, b)) @ R[:, None]
+
+
+def _brown(distortions: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    k1, k2, p1, p2, k3 = distortions
+    r2 = a * a + b * b
+    L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))  # (3)
+    return a * L + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * L + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b  # (4)
+
+
+def _brown_derivatives(distortions: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """∂a'/∂a, ∂a'/∂b = ∂b'/∂a and ∂b'/∂b of (3) and (4)."""
+    k1, k2, p1, p2, k3 = distortions
+    r2 = a * a + b * b
+    L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    dL = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # dL/da = a dL, dL/db = b dL
+    cross = a * b * dL + 2 * p1 * a + 2 * p2 * b
+    return L + a * a * dL + 2 * p1 * b + 6 * p2 * a, cross, L + b * b * dL + 6 * p1 * b + 2 * p2 * a
+
+
+def _pixel_jacobian(
+    pixels: np.ndarray, a: np.ndarray, b: np.ndarray, inverse_z: np.ndarray, derivatives: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Derivatives (…, 2, 3) of pixels to a point in the camera's frame, element by element: numpy's products of single small matrices take
+    several times as long."""
+    aa, cross, bb = derivatives
+    out = np.empty((*a.shape, 2, 3))
+    for i, (x, y) in enumerate(pixels):
+        u, v = (x * aa + y * cross) * inverse_z, (x * cross + y * bb) * inverse_z
+        out[..., i, 0], out[..., i, 1], out[..., i, 2] = u, v, -(a * u + b * v)
+    return out
 
 
 def _ahead(p: np.ndarray) -> np.ndarray:

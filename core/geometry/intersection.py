@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .camera import Camera
+from .camera import Camera, project_all
 from .small_matrices import invert_spd
 
 STEPS = 4  # of (2), at most
-CONVERGED_M = 1e-7  # step
+RAY_TEST = 0.999  # probability of the χ² test of rays
+START_STEPS = 2  # of the rays from which (2) starts: within 10⁻⁶ of their directions
+CONVERGED_M = 1e-6  # step; the next one would be a thousandth of it
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
 MOST_MISS_SIGMAS = 3.0  # of the clicks, their root mean square; by chance one in 45 000 (two views) or 170 000 (three) misses by more
 
@@ -41,33 +43,36 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
 
     `xy_px` (N, K, 2) full-frame pixels, NaN where a point is not visible; `covariance_px2` (N, K, 2, 2).
     """
-    n = len(xy_px)
     visible = np.isfinite(xy_px).all(axis=2)
     rays = visible.sum(axis=1)
-    P = np.zeros((n, len(cameras), 2, 2))
-    P[visible] = invert_spd(covariance_px2[visible])
-    X = np.full((n, 3), np.nan)
-    good = rays >= 2
-    X[good] = _closest_points(cameras, xy_px[good], visible[good])
+    good = np.flatnonzero(rays >= 2)
+    n, xy, seen = len(xy_px), xy_px[good], visible[good]
+    P = np.zeros((len(good), len(cameras), 2, 2))
+    P[seen] = invert_spd(covariance_px2[good][seen])
+    X = _closest_points(cameras, xy, seen)
     for _ in range(STEPS):
-        N, rhs, _ = _normal_equations(cameras, X, xy_px, P, visible)
+        N, rhs, _ = _normal_equations(cameras, X, xy, P, seen)
         step = _solve(N, rhs)
         X += step
         if np.nanmax(np.abs(step), initial=0.0) < CONVERGED_M:
             break
-    N, _, v = _normal_equations(cameras, X, xy_px, P, visible)
-    K = np.full((n, 3, 3), np.nan)
-    usable = np.isfinite(N).all(axis=(1, 2)) & good
-    K[usable] = invert_spd(N[usable] + np.eye(3) * 1e-9)
-    X[~usable] = np.nan
+    N, _, v = _normal_equations(cameras, X, xy, P, seen)
+    usable = np.isfinite(N).all(axis=(1, 2))
     vPv = np.einsum("nki,nkij,nkj->n", np.nan_to_num(v), P, np.nan_to_num(v))
-    return Intersection(
-        xyz_m=X,
-        covariance_m2=K,
-        residual_px=np.where(usable[:, None, None], v, np.nan),
-        sigma0=np.where(usable, np.sqrt(vPv / np.maximum(2 * rays - 3, 1)), np.nan),
-        rays=rays,
-    )
+    xyz, K, residual, sigma0 = (np.full((n, *shape), np.nan) for shape in ((3,), (3, 3), xy_px.shape[1:], ()))
+    rows = good[usable]
+    xyz[rows], residual[rows] = X[usable], v[usable]
+    K[rows] = invert_spd(N[usable] + np.eye(3) * 1e-9)
+    sigma0[rows] = np.sqrt(vPv[usable] / np.maximum(2 * rays[rows] - 3, 1))
+    return Intersection(xyz_m=xyz, covariance_m2=K, residual_px=residual, sigma0=sigma0, rays=rays)
+
+
+def chi2_limit(rays: np.ndarray) -> np.ndarray:
+    """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
+    from scipy.special import gammaincinv
+
+    redundant = np.maximum(2 * rays - 3, 1)
+    return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
 def intersect_clicks(cameras: Sequence[Camera], xy_px: np.ndarray, sigma_px: float | np.ndarray = CLICK_SIGMA_PX) -> Intersection:
@@ -92,10 +97,10 @@ def doubtful_view(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:
 
 
 def _closest_points(cameras: Sequence[Camera], xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """The points closest to the rays (N, 3): Σ (I − d dᵀ)(X − C) = 0."""
+    """The points closest to the rays (N, 3), approximately: Σ (I − d dᵀ)(X − C) = 0."""
     A, b = np.zeros((len(xy), 3, 3)), np.zeros((len(xy), 3))
     for k, camera in enumerate(cameras):
-        d = camera.rays(np.where(visible[:, k, None], xy[:, k], 0.0))
+        d = camera.rays(np.where(visible[:, k, None], xy[:, k], 0.0), START_STEPS)
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * visible[:, k, None, None]
         A += across
@@ -106,14 +111,14 @@ def _closest_points(cameras: Sequence[Camera], xy: np.ndarray, visible: np.ndarr
 def _normal_equations(
     cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray, visible: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    N, rhs, v = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3)), np.full(xy.shape, np.nan)
-    for k, camera in enumerate(cameras):
-        image, J = camera.project_with_jacobian(X)
-        v[:, k] = np.where(visible[:, k, None], xy[:, k] - image, np.nan)
-        JP = np.where(visible[:, k, None, None], J.transpose(0, 2, 1) @ P[:, k], 0.0)
-        N += JP @ np.where(visible[:, k, None, None], J, 0.0)
-        rhs += np.einsum("nij,nj->ni", JP, np.where(visible[:, k, None], v[:, k], 0.0))
-    return N, rhs, v  # (2)
+    image, J = project_all(cameras, X)
+    there = visible.T
+    v = np.where(there[..., None], xy.transpose(1, 0, 2) - image, np.nan)
+    J = np.where(there[..., None, None], J, 0.0)
+    JP = np.where(there[..., None, None], P.transpose(1, 0, 2, 3) @ J, 0.0)
+    N = np.einsum("knia,knib->nab", JP, J)
+    rhs = np.einsum("knia,kni->na", JP, np.where(there[..., None], v, 0.0))
+    return N, rhs, v.transpose(1, 0, 2)  # (2)
 
 
 def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:

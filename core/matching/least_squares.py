@@ -33,6 +33,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -42,25 +43,27 @@ from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from .parameter_sets import PARAMETERS, reduced_sets
-from .patches import compare, patch_offsets, template_pixels
+from .patch_steps import PatchSteps, compose
+from .patches import patch_offsets, template_pixels
 
 LARGEST = 4096  # patches of a piece
 SHARED_FROM = 513  # patches from which on threads share them
 MIN_CONDITION = 1e-6  # added to the scaled diagonal of the whole one
-MAX_STEP_PX = 2.0  # px, longer steps are shortened
-MIN_DETERMINANT = 0.1  # of I + B; a smaller one has no usable inverse
 COMPACT_BELOW = 0.75  # of the patches at work: if fewer still move, the others are taken out of the arrays
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma is the last
 REST_SIGMAS = 0.1  # of the point's sigma, rest after the last step that is accepted where (6) predicts it
 REST_PX = 0.005  # px, the same, where it is more
 GRADIENT_NOISE = 0.45  # of (6)
 CURVATURE_RATE = 0.1  # smallest λ of (6)
+GIVE_UP = ((5, 0.15), (9, 0.05))  # iterations after which a patch is given up whose correlation is so much below the smallest
 LINEAR_PX = 0.25  # px by which any part of the patch may move for (6) to apply
 SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled for the reported sigma0
 INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
 TEXTURED_RMS = 0.5  # grey values, smallest RMS contrast of a patch
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # a 3×3 matrix from its upper part
-PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # arrays
+OF_PIXELS = ("f", "fx", "fy")  # arrays of each patch's pixels, and
+JUDGED = ("q", "inside", "contrast", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # of each patch
+PER_PATCH = (*OF_PIXELS, *JUDGED)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -121,6 +124,10 @@ class Matches:
     parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture does not determine the shape
     status: np.ndarray  # (N,) MatchStatus
 
+    def select(self, rows: slice) -> "Matches":
+        """Only these patches."""
+        return Matches(**{name: getattr(self, name)[rows] for name in Matches.__dataclass_fields__})
+
     @property
     def transfer_xy(self) -> np.ndarray:
         """(N, 2) position of the texture's centre of gravity, x_o of (5)."""
@@ -161,15 +168,23 @@ class SearchImage:
 
 
 def match_patches(
-    template: TemplatePoints, searches: Sequence[SearchImage], settings: MatchingSettings, *, monitor: Monitor | None = None
+    template: TemplatePoints,
+    searches: Sequence[SearchImage],
+    settings: MatchingSettings,
+    *,
+    needed: int = 0,
+    monitor: Monitor | None = None,
 ) -> list[Matches]:
-    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image."""
+    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image.
+
+    A point that fewer than `needed` images can still match is given up; it is NOT_CONVERGED in the others.
+    """
     n = len(template.xy)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches])
+        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches], needed)
 
     parts = in_threads(work, _pieces(n))
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
@@ -225,10 +240,10 @@ class PatchTemplates:
         self.noise_factor = correlated_noise(p.fx.reshape(patch), p.fy.reshape(patch), image.smoothing)
         self.textured = self.contrast > TEXTURED_RMS * np.sqrt(self.n_pixels)
 
-    def select(self, rows: np.ndarray | slice) -> "PatchTemplates":
-        """Only these rows (a mask, indices or a slice)."""
+    def select(self, rows: np.ndarray | slice, names: Sequence[str] = PER_PATCH) -> "PatchTemplates":
+        """Only these rows (a mask, indices or a slice), of the arrays of these names."""
         chosen = copy(self)
-        for name in PER_PATCH:
+        for name in names:
             setattr(chosen, name, getattr(self, name)[rows])
         return chosen
 
@@ -247,56 +262,15 @@ class PatchTemplates:
         mean, q = mean.astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
-    def find(self, searches: Sequence[SearchImage]) -> list[Matches]:
-        """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
-        N, transferred = len(self.inside), self._transferred()
-        start, shape = (
-            np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images])
-            for of_images in ([search.start for search in searches], [search.shape for search in searches])
-        )
-        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches))
-        spans = [slice(k * N, (k + 1) * N) for k in range(len(searches))]
-        return [
-            self._judge(SearchImage(image=search.image, start=start[r], shape=shape[r]), settled.select(r), transferred)
-            for search, r in zip(searches, spans)
-        ]
+    def find(self, searches: Sequence[SearchImage], needed: int = 0) -> list[Matches]:
+        """The matches in every image."""
+        matching = Matching([search.image for search in searches], self._settings, needed)
+        start, shape = (np.stack(a).astype(np.float64) for a in ([s.start for s in searches], [s.shape for s in searches]))
+        matching.add(self, start, shape)
+        matching.advance()
+        return matching.take()[1]
 
-    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> "_Settled":
-        """The results of (2) and (3) for the patches that begin as NOT_CONVERGED."""
-        most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
-        c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
-        alive = status == MatchStatus.NOT_CONVERGED
-        harmless = _starts_at_work(start, alive, len(images))  # finished patches still take part in steps, there
-        place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, harmless), np.where(alive[:, None, None], A, np.eye(2))
-        work = _AtWork(self, images, place)
-        for iteration in range(1, most + 1):
-            if not alive.any():
-                break
-            if np.count_nonzero(alive) < COMPACT_BELOW * len(alive):
-                place, at, warp, alive = place[alive], at[alive], warp[alive], alive[alive]
-                work = _AtWork(self, images, place)
-            step, rho, gain = work.step(at, warp)
-            at, warp, moved = compose(at, warp, step)
-            lost = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
-            near, spared = self._converged(step, moved, work.sigma(rho))
-            finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
-            here = place[finished]
-            rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
-            c[here], A[here], correlation[here], iterations[here] = at[finished], warp[finished], rho[finished], iteration
-            status[here] = np.where((near | spared)[finished], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
-            status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
-            alive[finished] = False
-            at[lost], warp[lost] = harmless[place[lost]], np.eye(2)
-        return _Settled(c=c, A=A, status=status, correlation=correlation, iterations=iterations)
-
-    def _usable(self, searches: Sequence[SearchImage]) -> np.ndarray:
-        """The statuses that patches have before they move; NOT_CONVERGED are those that can be matched."""
-        lost = ~np.concatenate([search.image.inside(search.start, 0.0) & self.inside for search in searches])
-        status = np.where(np.tile(self.textured, len(searches)), MatchStatus.NOT_CONVERGED, MatchStatus.NO_TEXTURE).astype(np.int8)
-        status[lost] = MatchStatus.OUT_OF_IMAGE
-        return status
-
-    def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which patches' last step was small; and for which it predicts by (6) that the next would be."""
         rate = np.maximum(CURVATURE_RATE, GRADIENT_NOISE * self.n_pixels * sigma**2)
         linear = moved + self.half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
@@ -310,10 +284,10 @@ class PatchTemplates:
         E = np.concatenate([np.ones((len(self.offset), 1)), self.offset], axis=1)
         return np.einsum("nabj,nj->nab", np.einsum("naibj,ni->nabj", self.inverse.reshape(-1, 2, 3, 2, 3), E), E)
 
-    def _judge(self, search: SearchImage, settled: "_Settled", transferred: np.ndarray | None) -> Matches:
+    def judged(self, search: SearchImage, found: "_Found") -> Matches:
         """The matches in one image, with covariances (4) and (5), and the first limit that each exceeds as its status."""
-        c, A, status, correlation = settled.c, settled.A, settled.status, settled.correlation
-        s = self._settings
+        c, A, status, correlation = found.c, found.A, found.status, found.correlation
+        s, transferred = self._settings, self._transferred()
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
         variance = self.noise_factor * self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
@@ -340,81 +314,116 @@ class PatchTemplates:
             transfer_covariance=K_o,
             sigma0=sigma0,
             correlation=correlation,
-            iterations=settled.iterations,
+            iterations=found.iterations,
             parameters=self.parameters,
             status=status,
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Settled:
-    """Where the iterations left M patches, all of one image or image after image."""
+class _Found:
+    """Where the iterations are with N patches in S images: the first two axes of every array, or the only ones after `at`."""
 
-    c: np.ndarray  # (M, 2)
-    A: np.ndarray  # (M, 2, 2)
-    status: np.ndarray  # (M,) MatchStatus
-    correlation: np.ndarray  # (M,)
-    iterations: np.ndarray  # (M,)
+    c: np.ndarray  # (S, N, 2)
+    A: np.ndarray  # (S, N, 2, 2)
+    status: np.ndarray  # (S, N) MatchStatus
+    correlation: np.ndarray  # (S, N)
+    iterations: np.ndarray  # (S, N)
 
-    def select(self, rows: slice) -> "_Settled":
-        """Only these patches."""
-        return _Settled(**{f.name: getattr(self, f.name)[rows] for f in fields(_Settled)})
-
-
-def _starts_at_work(start: np.ndarray, alive: np.ndarray, images: int) -> np.ndarray:
-    """For each row (N · images, 2) a place among the starts of its image that are `alive`: no other part of it is to be interpolated."""
-    by_image, there = start.reshape(images, -1, 2), alive.reshape(images, -1)
-    if not there.size:
-        return start
-    first = np.where(there.any(axis=1)[:, None], by_image[np.arange(images), there.argmax(axis=1)], 0.0)
-    return np.repeat(first, there.shape[1], axis=0)
+    def at(self, rows: Any) -> "_Found":
+        """Only these rows of the arrays."""
+        return _Found(**{f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(_Found)})
 
 
-class _AtWork:
-    """The patches of a piece that still move: the rows `place` (m,) of all patches in all images, image after image."""
+class Matching:
+    """Patches that are searched for in S images, a few iterations at a time, while others are added.
 
-    def __init__(self, templates: PatchTemplates, images: Sequence[SplineImage], place: np.ndarray) -> None:
-        t, N = templates, len(templates.inside)
-        cuts = np.searchsorted(place, np.arange(len(images) + 1) * N)
-        own = [place[a:b] - k * N for k, (a, b) in enumerate(zip(cuts, cuts[1:]))]  # rows of the templates
-        parts = [slice(None) if len(rows) == N else rows for rows in own]  # no copies
-        self._views = [
-            (image, slice(a, b), (t.f[part], t.fx[part], t.fy[part])) for image, a, b, part in zip(images, cuts, cuts[1:], parts) if b > a
-        ]
-        self._half, self._dof = t.half, max(1, t.n_pixels - PARAMETERS)
-        self._contrast, self._q, self._inverse = (
-            np.concatenate([a[part] for part in parts]) if len(parts) > 1 else a[parts[0]] for a in (t.contrast, t.q, t.inverse)
+    A point that fewer than `needed` images can still match is given up.
+    """
+
+    def __init__(self, images: Sequence[SplineImage], settings: MatchingSettings, needed: int = 0) -> None:
+        self._images, self._settings, self._needed = images, settings, needed
+        self._templates: PatchTemplates | None = None
+
+    def add(self, templates: PatchTemplates, start: np.ndarray, shape: np.ndarray) -> None:
+        """More patches, from positions (S, n, 2) and shapes (S, n, 2, 2)."""
+        S, n = start.shape[:2]
+        status = np.where(templates.textured, MatchStatus.NOT_CONVERGED, MatchStatus.NO_TEXTURE).astype(np.int8)[None].repeat(S, axis=0)
+        for k, image in enumerate(self._images):
+            status[k, ~(image.inside(start[k], 0.0) & templates.inside)] = MatchStatus.OUT_OF_IMAGE
+        alive = status == MatchStatus.NOT_CONVERGED
+        alive &= alive.sum(axis=0) >= self._needed
+        found = _Found(
+            c=start.copy(), A=shape.copy(), status=status, correlation=np.zeros((S, n)), iterations=np.zeros((S, n), dtype=np.int16)
         )
+        new = {"_start": start, "_shape": shape, "_alive": alive}
+        if self._templates is None:
+            self._templates, self._found = templates, found
+        else:
+            new = {name: np.concatenate([getattr(self, name), a], axis=1) for name, a in new.items()}
+            self._templates = PatchTemplates.joined([self._templates, templates])
+            both = {f.name: np.concatenate([getattr(self._found, f.name), getattr(found, f.name)], axis=1) for f in fields(_Found)}
+            self._found = _Found(**both)
+        self._start, self._shape, self._alive = (new[name] for name in ("_start", "_shape", "_alive"))
 
-    def step(self, c: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and the step's gain in ρ² where it is small enough to be linear."""
-        found = [compare(image, c[rows], A[rows], self._half, patches) for image, rows, patches in self._views]
-        power, along, pulled = found[0] if len(found) == 1 else (np.concatenate(parts) for parts in zip(*found))
-        gain = self._contrast * along / power  # r1
-        rhs = ((pulled - self._q * along[:, None]) * gain[:, None]).astype(np.float64)
-        step = np.einsum("nij,nj->ni", self._inverse, rhs)
-        explained = np.einsum("ni,ni->n", step, rhs) / np.maximum(self._contrast, 1e-6) ** 2
-        return step, along / np.sqrt(power), explained
+    def advance(self, share: float = 0.0) -> None:
+        """Iterate (2) and (3) until no more than a share of the patches that move now still do."""
+        t, s, (S, N) = self._templates, self._settings, self._alive.shape
+        c, A, status, correlation, iterations = (getattr(self._found, f.name) for f in fields(_Found))
+        c, A, start, shape = (a.reshape(S * N, *a.shape[2:]) for a in (c, A, self._start, self._shape))
+        status, correlation, iterations, moving = (a.reshape(S * N) for a in (status, correlation, iterations, self._alive))
+        place = np.flatnonzero(moving)
+        if t is None or not len(place):
+            return
+        open_, few = self._alive.sum(axis=0) + (self._found.status == MatchStatus.OK).sum(axis=0), share * len(place)
+        at, warp, alive, work = c[place], A[place], np.ones(len(place), dtype=bool), PatchSteps(t, self._images, place)
+        _, first = np.unique(place // N, return_index=True)
+        harmless = dict(zip((place[first] // N).tolist(), start[place[first]]))  # no other part of an image is to be interpolated
+        while np.count_nonzero(alive) > few:
+            if np.count_nonzero(alive) < COMPACT_BELOW * len(alive):
+                place, at, warp, alive = place[alive], at[alive], warp[alive], alive[alive]
+                work = PatchSteps(t, self._images, place)
+            step, rho, gain = work.step(at, warp)
+            at, warp, moved = compose(at, warp, step)
+            iterations[place] += alive
+            iteration = iterations[place]
+            lost = (largest(at - start[place]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            lost |= largest((warp - shape[place]).reshape(-1, 4)) > 2 * s.max_shear
+            near, spared = t.converged(step, moved, work.sigma(rho))
+            good = alive & (near | spared) & ~lost
+            low = alive & ~good & (rho < s.min_correlation - _shortfall(iteration))
+            rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
+            failed = alive & (lost | low | (good & (rho < s.min_correlation)) | ((iteration >= s.max_iterations) & ~good))
+            np.subtract.at(open_, place[failed] % N, 1)
+            finished = np.flatnonzero(alive & (good | failed | (open_[place % N] < self._needed)))
+            here = place[finished]
+            c[here], A[here], correlation[here] = at[finished], warp[finished], rho[finished]
+            status[place[good]] = MatchStatus.OK
+            status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
+            status[place[low & ~lost]] = MatchStatus.LOW_CORRELATION
+            alive[finished] = moving[here] = False
+            for row in np.flatnonzero(lost).tolist():
+                at[row], warp[row] = harmless[int(place[row] // N)], np.eye(2)
+        c[place[alive]], A[place[alive]] = at[alive], warp[alive]
 
-    def sigma(self, rho: np.ndarray) -> np.ndarray:
-        """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
-        variance = self._contrast.astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / self._dof
-        return np.asarray(np.sqrt(variance * np.maximum(self._inverse[:, 0, 0], self._inverse[:, 3, 3])))
+    def take(self) -> tuple[np.ndarray, list[Matches]]:
+        """Which of the patches (N,) no longer move in any image, and their matches in every image; they are removed."""
+        assert self._templates is not None
+        done = ~self._alive.any(axis=0)
+        own = self._templates if done.all() else self._templates.select(done, JUDGED)
+        matches = [
+            own.judged(SearchImage(image=image, start=self._start[k, done], shape=self._shape[k, done]), self._found.at((k, done)))
+            for k, image in enumerate(self._images)
+        ]
+        self._templates = None if done.all() else self._templates.select(~done)
+        self._found, self._alive = self._found.at((slice(None), ~done)), np.ascontiguousarray(self._alive[:, ~done])
+        self._start, self._shape = self._start[:, ~done], self._shape[:, ~done]
+        return done, matches
 
 
-def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px].  (3)"""
-    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
-    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
-    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
-    det = a * e - b * d
-    inverse = 1 / np.where(np.abs(det) < MIN_DETERMINANT, np.nan, det)
-    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
-    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
-    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
-    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
-    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
-    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
-    if bad.any():
-        A_new[bad], move[bad] = A[bad], 0.0
-    return c - move, A_new, moved
+def _shortfall(iteration: np.ndarray) -> np.ndarray:
+    """By how much the correlations (m,) may be below the smallest one at these iterations."""
+    allowed = np.full(len(iteration), np.inf)
+    for since, below in GIVE_UP:
+        allowed[iteration >= since] = below
+    return allowed

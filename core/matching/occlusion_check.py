@@ -17,10 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..images.sampling import SplineImage
 from .constraints import over_outline, surface_about
 from .least_squares import MatchingSettings
 from .object_space import Epipolar, SurfacePrior, SurfaceStarts, match_surface, px_per_inverse_metre
-from .patches import TemplatePatches
+from .patches import patch_offsets
 from .region_growing import MatchedField
 from .views import Views
 
@@ -83,11 +84,17 @@ def depth_uncertainty(
     inverse = planes.theta[:, 0]
     metres = 1 / (px_per_inverse_metre * inverse**2)  # a pixel of the fastest view
     off_px = np.where(found.ok, np.hypot((found.theta[:, 0] - inverse) * px_per_inverse_metre, found.sigma_px), DEPTH_SIGMA_PX)
-    centre = TemplatePatches(views.template, planes.xy, CENTRE_PX, views.rows.step)
-    variance = np.maximum(centre.contrast**2 / centre.pixels, 1e-9)
+    variance = np.maximum(_variance(views.template, planes.xy, views.rows.step), 1e-9)
     left = (1 - found.correlation.min(axis=1) ** 2) * variance - views.template.noise**2
     explained = np.where(found.ok, np.clip(1 - left / variance, LEAST_EXPLAINED, 1.0), 1.0)
     return np.asarray(np.hypot(off_px * metres, sigma_m) / explained)
+
+
+def _variance(image: SplineImage, xy: np.ndarray, row_step: int) -> np.ndarray:
+    """Variance (N,) of the grey values in the centres of the patches about xy (N, 2)."""
+    u, v, _ = patch_offsets(CENTRE_PX, row_step)
+    x, y = (xy[:, i, None].astype(np.float32) + d for i, d in ((0, u), (1, v)))
+    return image.sample(x, y).astype(np.float64).var(axis=1)
 
 
 def acceptable(uncertainty_m: np.ndarray, usual_ones: np.ndarray | slice = slice(None)) -> np.ndarray:

@@ -1,15 +1,15 @@
 """Region growing: dense matching from seeds, whole fronts of points at a time.
 
 As published (D'Apuzzo et al. 2000, §2.2) the reference image is the template, a point's start is its matched neighbour shifted with the
-neighbour's shape, and failed points are tried again from other neighbours. Here the neighbours of all points that were just accepted form
-one array, and a point is accepted only if enough views match it, its rays meet, and its depth continues that of its neighbour:
+neighbour's shape, and failed points are tried again from other neighbours. Here the neighbours of accepted points join the patches at work,
+and a point is accepted only if enough views match it, its rays meet, and its depth continues that of its neighbour:
 
     start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import product
+from itertools import count, product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,9 +17,9 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
 from ..geometry.camera import Camera
-from ..geometry.intersection import Intersection, forward_intersection
+from ..geometry.intersection import Intersection, chi2_limit, forward_intersection
 from .foreground import Foreground
-from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
+from .least_squares import Matches, Matching, MatchingSettings, PatchTemplates, SearchImage, TemplatePoints, match_patches
 from .seeds import Approximations
 from .views import TemplateGrid, Views
 
@@ -29,7 +29,7 @@ NOISE_SIGMAS = 4.0  # sigmas of a depth by which it may differ from its parent's
 EQUAL_SIGMA_PX = 1.0  # px, far above matching's own: all rays have the same weight
 PATCH_STEP_PX = 4  # px by which the patch grows from round to round
 SMOOTHED_FROM_LEVEL = 2  # rounds of larger patches, from which on the images are smoothed
-RAY_TEST = 0.999  # probability of the χ² test of rays
+AT_WORK = 0.5  # share of the patches at work with which the next front begins
 NARROW = -1  # level of the last round: fingers, and what shows next to an outline, are narrower than the patch
 SMALLEST_PATCH_PX = 5  # px, side of a patch
 NARROW_SIGMA_SHARE = 0.5  # of the largest sigma, in the last round: few pixels must have much texture
@@ -144,12 +144,24 @@ class _Cells:
         self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
         self.accepted, self.tried = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=bool)
         self.attempts = np.zeros(cells, dtype=np.int16)  # of this round
+        self.moving = np.zeros(cells, dtype=bool)  # at work now
+        self.began, self.when = np.full((2, cells), -1)  # the step of the round at which the last attempt began, and that of acceptance
 
-    def accept(self, front: "Front", measured: "_Measured", views: Views) -> None:
+    def begin(self, front: "Front", step: int) -> None:
+        """The cells of a front are tried now."""
+        self.attempts[front.cell] += 1
+        self.tried[front.cell] = self.moving[front.cell] = True
+        self.began[front.cell] = step
+
+    def restart(self) -> None:
+        """Begin a round: every cell may be tried anew."""
+        self.attempts[:], self.began[:], self.when[:] = 0, -1, -1
+
+    def accept(self, front: "Front", measured: "_Measured", views: Views, step: int) -> None:
         """Store what was measured at the cells of a front."""
         cell, reference, matched, point = front.cell, views.reference, measured.matched, measured.point
         xy = self.grid.xy(cell)
-        self.accepted[cell] = True
+        self.accepted[cell], self.when[cell] = True, step
         self.centre[cell, reference], self.xy[cell, reference] = xy, xy + matched[0].offset
         self.shape[cell] = front.shape  # also in views that are not matched
         self.shape[cell, reference], self.spread[cell] = np.eye(2), matched[0].spread
@@ -165,27 +177,32 @@ class _Cells:
         self.xyz[cell], self.covariance_m2[cell] = point.xyz_m, point.covariance_m2
         self.residual[cell], self.sigma0[cell] = point.rms_residual_px, point.sigma0
 
-    def next_front(self, fresh: np.ndarray, attempts: int, base: Camera) -> "Front":
-        """The neighbours of freshly accepted cells that are still open, with the predictions (1) of their parents."""
-        cell, parent = self._open_neighbours(fresh, attempts)
+    def next_front(self, fresh: np.ndarray, failed: np.ndarray, attempts: int, base: Camera) -> "Front":
+        """The open neighbours of freshly accepted cells, and failed cells with a new neighbour: the predictions (1) of these parents."""
+        cell, parent = self._to_try(fresh, failed, attempts)
         step = self.grid.xy(cell) - self.grid.xy(parent)
         start = self.centre[parent] + np.einsum("nkij,nj->nki", self.shape[parent], step)  # (1)
         return Front(cell=cell, start=start, shape=self.shape[parent], parent_depth_m=base.to_camera(self.xyz[parent])[:, 2])
 
-    def _open_neighbours(self, fresh: np.ndarray, attempts: int) -> tuple[np.ndarray, np.ndarray]:
-        """The open neighbours of the fresh cells, each with its best fresh parent (smallest variance)."""
-        gh, gw = self.grid.shape
-        i = (fresh % gw)[:, None] + NEIGHBOURS[:, 0]
-        j = (fresh // gw)[:, None] + NEIGHBOURS[:, 1]
-        cells, parents = (j * gw + i).ravel(), np.repeat(fresh, len(NEIGHBOURS))
-        usable = ((i >= 0) & (i < gw) & (j >= 0) & (j < gh)).ravel()
-        cells, parents = cells[usable], parents[usable]
-        open_ = ~self.accepted[cells] & (self.attempts[cells] < attempts)
-        cells, parents = cells[open_], parents[open_]
+    def _to_try(self, fresh: np.ndarray, failed: np.ndarray, attempts: int) -> tuple[np.ndarray, np.ndarray]:
+        """Open cells next to the fresh ones, and failed ones, each with its best parent (smallest variance) that is new to it."""
+        (parents, cells), (retried, beside) = self._pairs(fresh), self._pairs(failed)
+        cells, parents = np.concatenate([cells, retried]), np.concatenate([parents, beside])
+        good = ~(self.accepted | self.moving)[cells] & (self.attempts[cells] < attempts)
+        good &= self.accepted[parents] & (self.when[parents] >= self.began[cells])
+        cells, parents = cells[good], parents[good]
         quality = np.trace(self.covariance_m2[parents], axis1=1, axis2=2)
         order = np.lexsort((parents, quality, cells))
         cells, first = np.unique(cells[order], return_index=True)
         return cells, parents[order][first]
+
+    def _pairs(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cells with each of their neighbours in the grid."""
+        gh, gw = self.grid.shape
+        i = (cells % gw)[:, None] + NEIGHBOURS[:, 0]
+        j = (cells // gw)[:, None] + NEIGHBOURS[:, 1]
+        there = (i >= 0) & (i < gw) & (j >= 0) & (j < gh)
+        return np.repeat(cells, len(NEIGHBOURS))[there.ravel()], (j * gw + i)[there]
 
     def field(self, limit_px: float) -> MatchedField:
         """The accepted cells."""
@@ -221,6 +238,10 @@ class Front:
     def select(self, rows: np.ndarray) -> "Front":
         """Only these rows (a mask or indices)."""
         return Front(cell=self.cell[rows], start=self.start[rows], shape=self.shape[rows], parent_depth_m=self.parent_depth_m[rows])
+
+    def joined(self, other: "Front") -> "Front":
+        """The cells of both, one after the other."""
+        return Front(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Front)})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -293,23 +314,38 @@ class _Growth:
         self.limit_px, self._rig_sigma_px = _rig_quality(seeds.matched, seeds.point, growing)
 
     def run(self, this: _Round, seeds: Front, *, with_seeds: bool, restart: bool) -> None:
-        """One round: from the seeds, or, on a `restart`, from everything accepted so far."""
-        cells, attempts, front = self.cells, self._growing.attempts, seeds
+        """One round: from the seeds, or, on a `restart`, from everything accepted so far.
+
+        The neighbours of accepted points are tried as soon as half of the patches at work are matched; the slow ones go on beside them.
+        """
+        cells, attempts, front, views = self.cells, self._growing.attempts, seeds, this.views
+        none, required = np.zeros(0, dtype=np.int64), views.required_matches(this.pairs)
         if restart:
-            cells.attempts[:] = 0
-            front = cells.next_front(np.flatnonzero(cells.accepted), attempts, self._base)
+            cells.restart()
+            front = cells.next_front(np.flatnonzero(cells.accepted), none, attempts, self._base)
             front = _joined(cells, seeds, front) if with_seeds else front
-        while len(front.cell):
+        matching = Matching([views.images[k] for k in views.search], this.matching, required)
+        at_work = front.select(none)
+        for step in count():
+            if len(front.cell):
+                cells.begin(front, step)
+                at_work = at_work.joined(front)
+                template = TemplatePoints(image=views.template, xy=self._grid.xy(front.cell), row_step=views.rows.step)
+                start, shape = front.start[:, views.search].swapaxes(0, 1), front.shape[:, views.search].swapaxes(0, 1)
+                matching.add(PatchTemplates(template, this.matching), start, shape)
+            if not len(at_work.cell):
+                break
             self._monitor.step("surface", int(cells.accepted.sum()), len(cells.accepted))
-            cells.attempts[front.cell] += 1
-            cells.tried[front.cell] = True
-            xy = self._grid.xy(front.cell)
-            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs)
-            good = self._acceptable(measured, front.parent_depth_m, this.views.required_matches(this.pairs))
-            front = front.select(good)
-            cells.accept(front, measured.select(good), this.views)
-            cells.smoothed[front.cell] = this.smoothed
-            front = cells.next_front(front.cell, attempts, self._base)
+            matching.advance(AT_WORK)
+            done, matched = matching.take()
+            front, at_work = at_work.select(done), at_work.select(~done)
+            cells.moving[front.cell] = False
+            measured = _intersected(views, self._grid.xy(front.cell), matched, self._rig_sigma_px, required)
+            good = self._acceptable(measured, front.parent_depth_m, required)
+            accepted = front.select(good)
+            cells.accept(accepted, measured.select(good), views, step)
+            cells.smoothed[accepted.cell] = this.smoothed
+            front = cells.next_front(accepted.cell, front.cell[~good], attempts, self._base)
 
     def _acceptable(self, measured: _Measured, parent_depth_m: np.ndarray, matches: int) -> np.ndarray:
         """(n,) which points have enough matches, rays that meet, a depth that continues their parent's, and lie in the foreground."""
@@ -367,8 +403,7 @@ def _joined(cells: _Cells, seeds: Front, front: Front) -> Front:
     """The seeds that are not yet accepted, and the rest of a front."""
     fresh = ~cells.accepted[seeds.cell]
     rest = ~np.isin(front.cell, seeds.cell[fresh])
-    a, b = seeds.select(fresh), front.select(rest)
-    return Front(**{f.name: np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Front)})
+    return seeds.select(fresh).joined(front.select(rest))
 
 
 def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Front:
@@ -384,7 +419,12 @@ def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSetti
     """Match a front's points `xy` (n, 2) in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     template = TemplatePoints(image=views.template, xy=xy, row_step=views.rows.step)
     searches = [SearchImage(image=views.images[k], start=front.start[:, k], shape=front.shape[:, k]) for k in views.search]
-    matched = match_patches(template, searches, matching)
+    required = views.required_matches(pairs)
+    return _intersected(views, xy, match_patches(template, searches, matching, needed=required), rig_sigma_px, required)
+
+
+def _intersected(views: Views, xy: np.ndarray, matched: list[Matches], rig_sigma_px: float, required: int) -> _Measured:
+    """The points `xy` (n, 2) of the template at the intersection of their rays, where enough views match them."""
     image_xy = np.full((len(xy), len(views.cameras), 2), np.nan)
     rig = np.diag([1.0, 1 / views.rows.step**2]) * rig_sigma_px**2
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(views.cameras), 1, 1))
@@ -392,7 +432,7 @@ def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSetti
     for k, m in zip(views.search, matched):
         image_xy[m.ok, k] = m.transfer_xy[m.ok]
         K[m.ok, k] = m.transfer_covariance[m.ok] + rig
-    image_xy[~_enough(matched, views.required_matches(pairs))] = np.nan
+    image_xy[~_enough(matched, required)] = np.nan
     point = forward_intersection(views.cameras, views.rows.to_frame(image_xy), views.rows.covariance_to_frame(K))
     return _Measured(matched=matched, point=point, depth_m=views.base.to_camera(point.xyz_m)[:, 2])
 
@@ -400,14 +440,6 @@ def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSetti
 def _enough(matched: Sequence[Matches], required: int) -> np.ndarray:
     """(N,) whether as many views match the point as are required."""
     return np.asarray(np.sum([m.ok for m in matched], axis=0) >= required)
-
-
-def chi2_limit(rays: np.ndarray) -> np.ndarray:
-    """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
-    from scipy.special import gammaincinv
-
-    redundant = np.maximum(2 * rays - 3, 1)
-    return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
 PerPoint = TypeVar("PerPoint", Matches, Intersection)

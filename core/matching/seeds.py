@@ -82,19 +82,19 @@ def sweep_seeds(
     *,
     spacing_px: int,
     depth_range_m: tuple[float, float] | None,
-    within_px: tuple[np.ndarray, np.ndarray] | None = None,
+    near_px: tuple[np.ndarray, np.ndarray] | None = None,
     monitor: Monitor,
     pairs: bool = False,
 ) -> Approximations:
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
-    `within_px`, a corner (2,) and the opposite one in rows' pixels, only cells in this box are searched. With `pairs`, one search view is
-    enough.
+    `near_px`, places (N, 2) and a distance (2,) in rows' pixels, only cells about these places are searched. With `pairs`, one search view
+    is enough.
     """
     xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
-    if within_px is not None:
-        xy = xy[((xy >= within_px[0]) & (xy <= within_px[1])).all(axis=1)]
+    if near_px is not None:
+        xy = xy[_near(xy, *near_px)]
     xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
     near, far = depth_range_m or _default_range(views)
@@ -111,6 +111,14 @@ def sweep_seeds(
     parts = in_threads(work, equal_pieces(len(xy), block, 2))
     depth, good = (np.concatenate(a) for a in zip(*parts))
     return approximations_at_depth(views.cameras, views.reference, views.rows, xy[good], depth[good])
+
+
+def _near(xy: np.ndarray, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(N,) which points (N, 2) lie within a distance (2,) of any of the places (M, 2), in both directions."""
+    from scipy.spatial import cKDTree
+
+    nearest, _ = cKDTree(places / distance).query(xy / distance, p=np.inf, distance_upper_bound=1.0)
+    return np.isfinite(nearest)
 
 
 def sweep_ray(views: Views, xy: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None = None) -> float | None:

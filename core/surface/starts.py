@@ -30,7 +30,7 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import SurfaceSettings
 
-ALGORITHM = "surface 22"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 23"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
 SEED_SPEED_M_S = 1.0  # sigma of the speed in depth at which seeds come from the frame before
@@ -38,6 +38,7 @@ ANY_DEPTH_M = (fg.NEAREST_M, 1e3)
 SUPPORT_SPACINGS = 2.2  # spacings of the seeds within which others support a seed,
 SUPPORT_M = 0.15  # m, if their depths differ by less
 SUPPORT = 2  # so many of them
+ABOUT_SEED_M = 0.3  # m from a seed in the frame before, as far as a hand moves meanwhile, within which the person is searched for
 MIN_SEEDS = 8  # supported ones; fewer do not show where the person is
 
 
@@ -122,7 +123,7 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
         depth, fewest = now.views.base.to_camera(before.person_m)[:, 2], MIN_SEEDS if before.field is None else fg.MIN_CLOUD
         where = fg.after(depth, before.where, fewest)
         if before.field is None:
-            seeds = _swept(now, settings, where.depth_range_m, monitor, _box_of_person(now, before.person_m))
+            seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))
         else:
             seeds = _seeds_of_before(now, settings, before.field, before.frame)
     sources = silhouette_sources(now.footage)
@@ -241,14 +242,14 @@ def frame_views(footage: Footage, frame: int, settings: MeasureSettings, *, firs
     )
 
 
-def _box_of_person(now: FrameViews, before_m: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Where in the reference image (rows' pixels) a person can be of whom points (N, 3) in the frame before are known; None: anywhere."""
+def _about_person(now: FrameViews, before_m: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where in the reference image (rows' pixels) a person can be of whom points (N, 3) in the frame before are known: about these places,
+    within a distance (2,); None: anywhere."""
     if len(before_m) < MIN_SEEDS:
         return None
     views = now.views
-    at = views.rows.from_frame(views.base.project(before_m))
-    reach = fg.REACH_M * views.base.focal_px / float(np.median(views.base.to_camera(before_m)[:, 2])) / np.array([1.0, views.rows.step])
-    return at.min(axis=0) - reach, at.max(axis=0) + reach
+    pixel_m = float(np.median(views.base.to_camera(before_m)[:, 2])) / views.base.focal_px
+    return views.rows.from_frame(views.base.project(before_m)), ABOUT_SEED_M / pixel_m / np.array([1.0, views.rows.step])
 
 
 def _swept(
@@ -256,7 +257,7 @@ def _swept(
     settings: MeasureSettings,
     depth_range_m: tuple[float, float] | None,
     monitor: Monitor,
-    within_px: tuple[np.ndarray, np.ndarray] | None = None,
+    near_px: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Approximations:
     """The automatic seeds of a frame within a range of depths."""
     growing = settings.growing
@@ -266,7 +267,7 @@ def _swept(
         settings.matching,
         spacing_px=growing.seed_spacing_px or SEED_SPACING_PX,
         depth_range_m=depth_range_m,
-        within_px=within_px,
+        near_px=near_px,
         monitor=monitor,
         pairs=growing.pairs,
     )

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..geometry.robust import mad_sigma
 from ..geometry.rotation import cross_matrix, rotation_from_vector
+from ..geometry.small_matrices import invert_spd
 
 NEIGHBOURS = 14
 STEPS = 6  # of (1)
@@ -81,20 +82,24 @@ def common_motion(
 
 def _leverage(x: np.ndarray, p: np.ndarray, w: np.ndarray) -> np.ndarray:
     """1 / Σ w + tr([x]× J⁻¹ [x]×ᵀ) / 3, J the matrix of (1): the effect at x (N, 3) of errors of the neighbours p (N, m, 3)."""
-    J = -np.einsum("nm,nmi,nmj->nij", w, p, p, optimize=True)
-    J += np.eye(3) * (np.einsum("nm,nmi,nmi->n", w, p, p, optimize=True) + w.sum(axis=1) * NOISE_M**2 + 1e-15)[:, None, None]
     X = cross_matrix(x)
-    turned = np.einsum("nij,njk,nik->n", X, np.linalg.inv(J), X, optimize=True) / 3
-    return 1 / np.maximum(w.sum(axis=1), 1e-12) + turned
+    turned = ((X @ invert_spd(_inertia((w[..., None] * p).transpose(0, 2, 1) @ p, w))) * X).sum(axis=(1, 2)) / 3
+    return np.asarray(1 / np.maximum(w.sum(axis=1), 1e-12) + turned)
 
 
 def _turn(P: np.ndarray, Q: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Rotation vectors ω (N, 3) of (1), at most a radian."""
-    torque = np.einsum("nm,nmi->ni", w, np.cross(P, Q - P))
-    J = -np.einsum("nm,nmi,nmj->nij", w, P, P, optimize=True)
-    J += np.eye(3) * (np.einsum("nm,nmi,nmi->n", w, P, P, optimize=True) + w.sum(axis=1) * NOISE_M**2 + 1e-15)[:, None, None]
-    omega = np.linalg.solve(J, torque[..., None])[..., 0]
-    return omega / np.maximum(1.0, np.linalg.norm(omega, axis=1))[:, None]
+    weighted = (w[..., None] * P).transpose(0, 2, 1)
+    M = weighted @ Q  # Σ w P × (Q − P) is twice its antisymmetric part
+    torque = np.stack([M[:, 1, 2] - M[:, 2, 1], M[:, 2, 0] - M[:, 0, 2], M[:, 0, 1] - M[:, 1, 0]], axis=1)
+    omega = np.einsum("nij,nj->ni", invert_spd(_inertia(weighted @ P, w)), torque)
+    return np.asarray(omega / np.maximum(1.0, np.linalg.norm(omega, axis=1))[:, None])
+
+
+def _inertia(moments: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """The matrix (N, 3, 3) of (1) from Σ w P Pᵀ (N, 3, 3)."""
+    total = np.einsum("nii->n", moments) + w.sum(axis=1) * NOISE_M**2 + 1e-15
+    return np.eye(3) * total[:, None, None] - moments
 
 
 def same_distance(

@@ -22,13 +22,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..foundation.progress import Monitor
-from ..foundation.threads import in_threads
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
 from ..images.interlace import FieldLayout, RowGrid
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
+from ..matching.least_squares import (
+    SHARED_FROM,
+    Matches,
+    Matching,
+    MatchingSettings,
+    PatchTemplates,
+    SearchImage,
+    TemplatePoints,
+    join_matches,
+    match_patches,
+)
 from ..matching.patches import patch_offsets
 from .curvature_correction import CurvatureCorrection
 from .neighbours import common_motion, nearest_neighbours
@@ -203,17 +213,26 @@ def mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
 
 
 def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
-    """The patch of frame i matched in frame i + 1, per view.  (3)"""
-    eye = np.tile(np.eye(2), (len(start), 1, 1))
+    """The patch of frame i matched in frame i + 1, per view, all views at once.  (3)"""
+    (n, K), row_step = status.shape, view.rows.step
 
-    def match(k: int) -> Matches:
-        begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
-        template = TemplatePoints(image=images.spline[k], xy=points.xy[:, k], row_step=view.rows.step, texture_centre=False)
-        m = match_patches(template, [SearchImage(image=images.next_spline[k], start=begin, shape=eye)], view.matching)[0]
+    def match(rows: slice) -> list[Matches]:
+        m = rows.stop - rows.start
+        templates, begin = list[PatchTemplates](), np.full((K, K, m, 2), np.nan)  # of each image, of each view's patches
+        for k in range(K):
+            template = TemplatePoints(image=images.spline[k], xy=points.xy[rows, k], row_step=row_step, texture_centre=False)
+            templates.append(PatchTemplates(template, view.matching))
+            begin[k, k] = np.where((status[rows, k] == TrackStatus.MEASURED)[:, None], start[rows, k], np.nan)
+        matching = Matching(images.next_spline, view.matching)
+        matching.add(PatchTemplates.joined(templates), begin.reshape(K, K * m, 2), np.tile(np.eye(2), (K, K * m, 1, 1)))
+        matching.advance()
+        return [matches.select(slice(k * m, (k + 1) * m)) for k, matches in enumerate(matching.take()[1])]
+
+    parts = in_threads(match, equal_pieces(n, max(1, n), SHARED_FROM))
+    temporal = [join_matches([part[k] for part in parts]) for k in range(K)]
+    for k, m in enumerate(temporal):
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
-        return m
-
-    return in_threads(match, range(len(view.cameras)))
+    return temporal
 
 
 def control(

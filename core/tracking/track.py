@@ -137,7 +137,7 @@ def _thinned(field: MatchedField, spacing_px: int) -> np.ndarray:
     return np.flatnonzero((i % n == 0) & (j % n == 0))
 
 
-ALGORITHM = "tracking 16"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 17"  # part of every key: raise it when the same input gives other numbers
 MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
 
 

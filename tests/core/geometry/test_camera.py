@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.geometry.camera import INTERIOR, Camera, camera_of, image_of, image_with_derivatives, interior_of
+from tricap.core.geometry.camera import INTERIOR, Camera, camera_of, image_of, image_with_derivatives, interior_of, project_all
 from tricap.core.geometry.rotation import rotation_from_vector
 
 STRONG = [-0.30, 0.12, 1.2e-3, -0.8e-3, -0.02]
@@ -54,6 +54,15 @@ def test_the_jacobian_agrees_with_differences(skew: float) -> None:
         scale = np.linalg.norm(J, axis=(1, 2))
         worst = np.abs(J[:, :, j] - difference).max(axis=1) / scale
         assert worst.max() < 2e-8, f"∂/∂{'XYZ'[j]}"  # measured 3e-9: rounding of 600 px / h
+
+
+@pytest.mark.parametrize("lens", ["Brown", "fisheye"])
+def test_all_cameras_at_once_are_each_by_itself(lens: str) -> None:
+    cameras = [camera(), camera(skew=1.7, affinity=(0.02, 0.03)), camera([0.1, 0, 0, 0, 0])] + ([fisheye()] if lens == "fisheye" else [])
+    X = np.concatenate([points(cameras[0]), [[np.nan] * 3, [0.0, 0.0, -50.0]]])
+    for camera_, xy, J in zip(cameras, *project_all(cameras, X), strict=True):
+        alone, derivatives = camera_.project_with_jacobian(X)
+        assert np.allclose(xy, alone, rtol=0, atol=1e-9, equal_nan=True) and np.allclose(J, derivatives, rtol=1e-12, equal_nan=True)
 
 
 @pytest.mark.parametrize("skew", [0.0, 1.7])

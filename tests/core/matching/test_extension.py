@@ -43,6 +43,16 @@ def weak(surfaces: ModuleType) -> tuple[Views, MatchedField, Any]:
     return measured(surfaces, "weak", noise=3.0)
 
 
+def test_seeds_about_places_are_those_that_lie_there(weak: tuple[Views, MatchedField, Any]) -> None:
+    views, field, _ = weak
+    everywhere = sweep_seeds(views, field.grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=Monitor())
+    places, reach = everywhere.xy[[3, 12], views.reference] + 5.0, np.array([40.0, 30.0])
+    found = sweep_seeds(views, field.grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), near_px=(places, reach), monitor=Monitor())
+    there = (np.abs(everywhere.xy[:, None, views.reference] - places) <= reach).all(axis=2).any(axis=1)
+    assert 1 < there.sum() < len(there)
+    assert np.array_equal(found.xy, everywhere.xy[there])
+
+
 def extended(views: Views, field: MatchedField) -> MatchedField:
     return extend(field, views, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
 

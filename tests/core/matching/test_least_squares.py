@@ -16,8 +16,10 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import (
     Matches,
+    Matching,
     MatchingSettings,
     MatchStatus,
+    PatchTemplates,
     SearchImage,
     TemplatePoints,
     join_matches,
@@ -346,6 +348,39 @@ def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -
             good = other.ok
             assert np.abs(other.xy - together[k].xy[rows])[good].max() < 1e-4
             assert np.allclose(other.covariance[good], together[k].covariance[rows][good], rtol=1e-3)
+
+
+def test_patches_that_join_while_others_move_give_the_same() -> None:
+    random = np.random.default_rng(3)
+    a, b = (SplineImage(g) for g in noisy_pair(1.5, 2.0, (0.4, -0.3), 0))
+    xy = np.rint(random.uniform(20, SIZE - 20, (120, 2)))
+    start, eye = xy + random.normal(0, 0.9, xy.shape), np.tile(np.eye(2), (len(xy), 1, 1))
+    together = match_patches(TemplatePoints(image=a, xy=xy), [SearchImage(image=b, start=start, shape=eye)], USUAL)[0]
+    matching, at_work, seen = Matching([b], USUAL), np.zeros(0, dtype=int), []
+    for rows, share in zip(np.array_split(np.arange(len(xy)), 4), (0.5, 0.5, 0.5, 0.0), strict=True):
+        at_work = np.concatenate([at_work, rows])
+        matching.add(PatchTemplates(TemplatePoints(image=a, xy=xy[rows]), USUAL), start[None, rows], eye[None, rows])
+        matching.advance(share)
+        done, (found,) = matching.take()
+        seen.append(at_work[done])
+        assert np.array_equal(found.status, together.status[seen[-1]])
+        assert np.abs(found.xy - together.xy[seen[-1]])[found.ok].max(initial=0.0) < 1e-4
+        at_work = at_work[~done]
+    assert 0 < len(seen[0]) < 30  # the slow ones went on beside the next
+    assert sorted(np.concatenate(seen).tolist()) == list(range(len(xy)))
+
+
+def test_a_point_that_one_image_cannot_match_is_given_up_in_the_others() -> None:
+    (a, b), other = noisy_pair(1.5, 1.0, (0.4, -0.3), 0), noisy_pair(1.5, 1.0, (0, 0), 9)[0]
+    xy = points()
+    eye = np.tile(np.eye(2), (len(xy), 1, 1))
+    searches = [SearchImage(image=SplineImage(g), start=xy + 1.5, shape=eye) for g in (b, other)]
+    template = TemplatePoints(image=SplineImage(a), xy=xy)
+    each, both = (match_patches(template, searches, USUAL, needed=needed) for needed in (0, 2))
+    assert each[0].ok.mean() > 0.9 and each[1].ok.mean() < 0.05
+    assert both[0].iterations.sum() < each[0].iterations.sum()
+    assert np.array_equal(both[0].ok & both[1].ok, each[0].ok & each[1].ok)
+    assert np.median(each[1].iterations) < 0.5 * USUAL.max_iterations  # so little alike: not tried to the end
 
 
 def test_patches_about_whole_pixels_are_those_by_interpolation() -> None:

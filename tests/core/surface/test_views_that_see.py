@@ -10,9 +10,9 @@ import pytest
 
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.intersection import chi2_limit
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.matching.region_growing import chi2_limit
 from tricap.core.motion.formats.ply import read_ply
 from tricap.core.run import pipeline, take_run
 
