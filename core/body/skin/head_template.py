@@ -107,6 +107,7 @@ def _finished(vertices: np.ndarray, rings: np.ndarray, cap: np.ndarray, u: np.nd
         bones=(OWN,),
         uv=np.concatenate([uv, cap_uv]),
         uv_size=(GIRTH + MARGIN + high[0] - low[0], float(max(v[-1], high[1] - low[1]))),
+        girth=GIRTH,
         ring=COLUMNS,
         own=own,
         column=np.arange(len(vertices)) % COLUMNS,
