@@ -1,4 +1,4 @@
-"""Movies of the scene, from a camera of their own: the body in motion, or one frame of it on a turntable. Workbench, as `preview`.
+"""Movies of the scene, from a camera of their own: the body in its colours in motion, or one frame of it on a turntable. Workbench.
 
     place = centre + distance (cos e · u(a), sin e) ,   distance = MARGIN · radius / sin(half the angle of view)               (1)
 
@@ -51,7 +51,7 @@ def turntable(path: Path, frame: int | None = None, monitor: Monitor | None = No
             place(360 * i / TURN_FRAMES, TURN_ELEVATION_DEG)
             yield _picture(scene)
 
-    with only_body(scene, HIDDEN), _own_camera(scene, [scene.frame_current], TURN_SIZE_PX) as place:
+    with only_body(scene, HIDDEN, "TEXTURE"), _own_camera(scene, [scene.frame_current], TURN_SIZE_PX) as place:
         _write_movie(path, pictures(place), TURN_FRAMES, TURN_FPS)
 
 
@@ -81,7 +81,7 @@ def film(
             yield _picture(scene)
 
     try:
-        with only_body(scene, WITHOUT), _own_camera(scene, frames, FILM_SIZE_PX) as place:
+        with only_body(scene, WITHOUT, "TEXTURE"), _own_camera(scene, frames, FILM_SIZE_PX) as place:
             _write_movie(path, pictures(place), len(frames), scene.render.fps / scene.render.fps_base)
     finally:
         scene.frame_set(before)

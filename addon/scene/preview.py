@@ -58,15 +58,18 @@ def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @contextmanager
-def only_body(scene: bpy.types.Scene, hidden: Collection[str] = HIDDEN) -> Iterator[None]:
-    """Render with Workbench on a transparent background, without the objects of some names; restores the scene afterwards."""
+def only_body(scene: bpy.types.Scene, hidden: Collection[str] = HIDDEN, colours: str = "MATERIAL") -> Iterator[None]:
+    """Render with Workbench on a transparent background, without the objects of some names; restores the scene afterwards.
+
+    `colours`: of the surfaces, "MATERIAL" or "TEXTURE", which is that of the material where there is no texture.
+    """
     render, shading = scene.render, scene.display.shading
     earlier = render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity
     left_out = [o for o in scene.objects if o.type in SHOWN and not o.hide_render and o.name.split(".")[0] in hidden]
     for thing in left_out:
         thing.hide_render = True
     render.engine, render.film_transparent = "BLENDER_WORKBENCH", True
-    shading.light, shading.color_type, shading.show_cavity = "STUDIO", "MATERIAL", True
+    shading.light, shading.color_type, shading.show_cavity = "STUDIO", colours, True
     try:
         yield
     finally:

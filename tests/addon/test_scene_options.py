@@ -419,6 +419,29 @@ def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path:
     assert int(movie.get(cv2.CAP_PROP_FRAME_COUNT)) == 48
 
 
+@pytest.mark.parametrize("movie", ["film", "turntable"])
+def test_movies_show_the_texture(empty: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, movie: str) -> None:
+    """And leave the shading as it was."""
+    from tricap.addon.scene import movies
+
+    scene = empty.context.scene
+    scene.frame_start = scene.frame_end = 1
+    armature = empty.data.objects.new("Body", empty.data.armatures.new("Body"))
+    scene.collection.objects.link(armature)
+    shading, seen = scene.display.shading, set()
+    before = shading.color_type
+
+    def pictured(scene: object) -> np.ndarray:
+        seen.add(shading.color_type)
+        return np.zeros((48, 64, 3), dtype=np.uint8)
+
+    monkeypatch.setattr(movies, "_picture", pictured)
+    monkeypatch.setattr(movies, "_extent", lambda scene, frames: (armature.location, 1.0))
+    arguments = dict(start_deg=0.0, turn_deg=0.0, elevation_deg=0.0) if movie == "film" else {}
+    getattr(movies, movie)(tmp_path / "m.mp4", **arguments)
+    assert seen == {"TEXTURE"} and shading.color_type == before
+
+
 @pytest.mark.slow
 def test_a_film_of_the_scene_shows_every_frame_from_another_side(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     """Without --blend only the movie is written; the camera circles, and leaves no trace in the scene; a stopped film is no film."""

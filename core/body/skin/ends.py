@@ -272,7 +272,7 @@ def _row_uv(quads: np.ndarray, low: int, high: int, pairs: np.ndarray, bottom: f
     u, v = np.concatenate([u, rolled @ INNER]), np.concatenate([v, v[pairs] @ INNER])
     around = u[quads]
     around = np.where(np.ptp(around, axis=1, keepdims=True) > 0.5, around + (around < 0.5), around)
-    return np.stack([2.0 * around / template.uv_size[0], 0.15 * v[quads] / template.uv_size[1]], axis=-1)
+    return np.stack([template.girth * around / template.uv_size[0], 0.15 * v[quads] / template.uv_size[1]], axis=-1)
 
 
 def rounded(vertices: np.ndarray, faces: np.ndarray, which: np.ndarray) -> np.ndarray:

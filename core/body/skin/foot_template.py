@@ -38,6 +38,7 @@ AROUND = np.array([[0.78, -0.78], [0, -1], [-0.78, -0.78], [-1, 0], [-0.78, 0.78
 TOE_SHARE = (0.12, 0.5, 0.85)  # of the toes' bone in the last upright ring and the two beyond it
 FOLLOWS_MM = (-62.0, 32.0)  # over which vertices pass from the shin to the foot, downwards …
 TILT = 0.40  # … and ahead
+GIRTH, GAP = 1.6, 0.03  # of the texture: width of the island from ankle to webs, and what is between it, those of the toes and the webs
 
 SOLIDS = (
     Solid((0, -4, -150), (40, 33), 1, end=(0, -4, 0)),  # shin
@@ -143,7 +144,7 @@ def foot_template() -> Template:
     body = _body()
     places, count = [body.reshape(-1, 3)], body.shape[0] * RING
     rings = np.arange(count).reshape(-1, RING)
-    u, v = 1.6 * np.arange(RING + 1) / RING, 0.15 + run_of(body) / UNIT_MM
+    u, v = GIRTH * np.arange(RING + 1) / RING, 0.15 + run_of(body) / UNIT_MM
     faces, uv = ([part] for part in tube(rings, u, v))
     webs, inner = rings[-1], {0: rings[-1][0], COLUMNS - 1: rings[-1][COLUMNS + 1]}
     for i, toe in enumerate(TOES):
@@ -152,7 +153,7 @@ def foot_template() -> Template:
                 inner[column] = count
                 places.append(_toe_rings(toe)[0, [corner]])
                 count += 1
-    left = 1.65
+    left, bottom = 0.0, float(v[-1]) + GAP
     for i, toe in enumerate(TOES):
         d, own = 1 + 3 * i, _toe_rings(toe)
         root = [*webs[d : d + 3], inner[3 * i + 2], *webs[[RING - d - 2, RING - d - 1, RING - d]], inner[3 * i]]
@@ -160,7 +161,7 @@ def foot_template() -> Template:
         tip = (own[-1].mean(axis=0) + 0.25 * (own[-1] - own[-2]).mean(axis=0))[None]
         places += [own[1:].reshape(-1, 3), tip]
         pole, count = count + beyond.size, count + beyond.size + 1
-        width, along = 8 * 2 * FULLER * toe.half[0][0] / UNIT_MM * 0.4, run_of(own) / UNIT_MM
+        width, along = 8 * 2 * FULLER * toe.half[0][0] / UNIT_MM * 0.4, bottom + run_of(own) / UNIT_MM
         for values, part in zip((faces, uv), tube(np.concatenate([[root], beyond]), left + width * np.arange(9) / 8, along)):
             values.append(part)
         faces.append(np.append(beyond[-1], pole)[[[0, 1, 8, 7], [1, 2, 3, 8], [8, 3, 4, 5], [7, 8, 5, 6]]])
@@ -170,16 +171,17 @@ def foot_template() -> Template:
             c, box = d + 2, np.array([[0, 1], [1, 1], [1, 0], [0, 0]]) * 0.05
             a, b = inner[3 * i + 2], inner[3 * i + 3]
             faces.append(np.array([[webs[c], webs[c + 1], b, a], [a, b, webs[RING - c - 1], webs[RING - c]]]))
-            uv.append(np.stack([box + [1.65 + 0.12 * i, 0.55], box + [1.65 + 0.12 * i, 0.60]]))
-        left += width + 0.03
-    vertices = np.concatenate(places)
+            uv.append(np.stack([box + [GIRTH + GAP, 0.12 * i], box + [GIRTH + GAP, 0.12 * i + 0.05]]))
+        left += width + GAP
+    vertices, islands = np.concatenate(places), np.concatenate(uv)
     return Template(
         vertices=vertices / UNIT_MM,
         faces=np.concatenate(faces),
         weights=_weights(vertices, rings),
         bones=(OWN, TOE),
-        uv=np.concatenate(uv),
-        uv_size=(float(max(left, 1.65 + 0.12 * len(TOES))), float(max(v[-1], 0.7))),
+        uv=islands,
+        uv_size=(float(islands[..., 0].max()), float(islands[..., 1].max())),
+        girth=GIRTH,
         ring=RING,
         own=_own(vertices, rings),
         column=np.arange(len(vertices)) % RING,

@@ -306,6 +306,7 @@ def hand_template() -> Template:
         bones=cage.bones,
         uv=np.concatenate(cage.uv),
         uv_size=size,
+        girth=girth,
         ring=RING,
         own=np.ones(len(places)),
         column=np.arange(len(places)) % RING,

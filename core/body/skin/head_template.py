@@ -46,12 +46,12 @@ SOLIDS = (
     Solid((0, 62, 81), (6.5, 8.5), 9, end=(0, 24, 103)),  # bridge of the nose
     Solid((0, 21.5, 104), (9.5, 8.5, 9.5), 6),  # its tip
     Solid((11.5, 16.5, 95), (7.5, 7.5, 10), 4, pair=True),  # its wings
-    Solid((0, -4, 80), (27, 15, 14), 10),  # mouth
+    Solid((0, -4, 76), (30, 18, 14), 14),  # mouth
     Solid((0, -3.0, 91.5), (4.2, 3.0), 4, end=(23, -8, 80), pair=True),  # upper lip
     Solid((0, -14.5, 89.5), (5.2, 3.4), 4, end=(20, -11.5, 80), pair=True),  # lower lip
     Solid((0, -8.6, 99), (2.2, 1.6), 2, end=(25, -9.4, 85), pair=True, hollow=True),  # between them
-    Solid((77, 43, -15), (7, 32, 18), 5, pair=True, turn_deg=(12, 24, 0)),  # ears
-    Solid((86, 41, -10), (8, 18, 10), 4, pair=True, hollow=True, turn_deg=(12, 24, 0)),  # their hollows
+    Solid((75, 43, -14), (9, 30, 19), 10, pair=True, turn_deg=(12, 20, 0)),  # ears
+    Solid((88, 42, -9), (8, 16, 9), 6, pair=True, hollow=True, turn_deg=(12, 20, 0)),  # their hollows
 )
 
 
@@ -107,6 +107,7 @@ def _finished(vertices: np.ndarray, rings: np.ndarray, cap: np.ndarray, u: np.nd
         bones=(OWN,),
         uv=np.concatenate([uv, cap_uv]),
         uv_size=(GIRTH + MARGIN + high[0] - low[0], float(max(v[-1], high[1] - low[1]))),
+        girth=GIRTH,
         ring=COLUMNS,
         own=own,
         column=np.arange(len(vertices)) % COLUMNS,

@@ -17,6 +17,7 @@ class Template:
     bones: tuple[str, ...]
     uv: np.ndarray  # (F, 4, 2) in units of length, from 0
     uv_size: tuple[float, float]
+    girth: float  # width of the island at the border
     ring: int
     own: np.ndarray  # (V,) 0 to 1: to what degree the weights are `weights`; for the rest they are those of the part's last ring
     column: np.ndarray  # (V,) the vertex of the border below a vertex

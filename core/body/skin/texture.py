@@ -12,8 +12,8 @@ ratios of vertices that two views show at the same time,
 
     ln g_a − ln g_b = median ln(I_a / I_b) ,   Σ ln g_v = 0                                                 (2)
 
-Texels that no view showed, or whose place was not measured, get colours from around them: the solution of Laplace's equation on the skin
-with the colours of the texels that were seen as boundary values. The mask distinguishes both.
+Texels that no view showed, or whose place was not measured, get colours from elsewhere on the body (`texture_fill`). The mask
+distinguishes both.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ from ..shape import BodyShape
 from .closed_skin import OneSkin
 from .person_skin import cage
 from .posed import Poser
-from .surface_operators import factorised, laplacian, vertex_normals
+from .surface_operators import vertex_normals
+from .texture_fill import Texels, filled
 
 TEXTURE, MASK = "texture.png", "texture_mask.png"  # in the folder skin/
 LEAST_COSINE = 0.3  # between normal and ray
@@ -47,7 +48,6 @@ FEWEST = 30  # common vertices of two views
 LEAST_HOLE_PX = 7  # texels; smaller holes have no rim
 RIM_PX = 3  # texels at the rim of what was seen, with the background in them, and as many over which it fades into what is filled
 PADDING_PX = 6  # around the islands
-STIFF, WEAK = 100.0, 1e-6  # ties of vertices that were seen to their colours, and of all to the mean
 MOST_FRAMES = 16  # evenly over the take
 
 
@@ -82,13 +82,15 @@ class TextureBaker:
     def __init__(self, skin: OneSkin, shape: BodyShape, size_px: int, views: int) -> None:
         self._skin, self._poser, self._size = skin, Poser(shape, skin.weights), size_px
         self._rows, self._cage = cage(skin)
-        self.texel, self._corners, self._shares = _texels(skin, size_px)
+        self.texel, corners, shares = _texels(skin, size_px)
+        ahead = self._poser.frames(np.zeros(len(shape.skeleton.dofs)))[0][0][:, 2]
+        self._texels = Texels(skin=skin, corners=corners, shares=shares, ahead=ahead)
         n = len(self.texel)
         self._kept = int(np.clip(KEPT * (LARGE_PX / size_px) ** 2, LEAST_KEPT, KEPT))
         self._weight = np.zeros((n, self._kept), dtype=np.float32)
         self._colour = np.zeros((n, self._kept), dtype=np.uint32)  # see `_packed`
         sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
-        self._trust = 1 / (1 + (self._at(sigma) / SIGMA_M) ** 2)
+        self._trust = 1 / (1 + (self._texels.at(sigma) / SIGMA_M) ** 2)
         self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
         self._views = views
 
@@ -96,7 +98,7 @@ class TextureBaker:
         """The images of all views in one frame, in which the body has the pose `motion` (D,)."""
         posed = self._poser.posed(self._skin.vertices_m, motion)
         normals = vertex_normals(posed, self._skin.faces)
-        places, across = self._at(posed), self._at(normals)
+        places, across = self._texels.at(posed), self._texels.at(normals)
 
         def shown(v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             view = views[v]
@@ -130,16 +132,12 @@ class TextureBaker:
         colour = np.zeros((len(self.texel), 3))
         colour[seen] = self._averaged(np.flatnonzero(seen), gain)
         inside = np.clip(self._from_unseen(seen) / RIM_PX - 1, 0, 1)
-        colour = inside[:, None] * colour + (1 - inside)[:, None] * self._filled(colour, inside == 1)
+        colour = inside[:, None] * colour + (1 - inside)[:, None] * filled(self._texels, colour, inside == 1)
         side = (self._size, self._size)
         rgb, mask, covered = np.zeros((*side, 3)), np.zeros(side, dtype=bool), np.zeros(side, dtype=bool)
         rgb.reshape(-1, 3)[self.texel] = colour
         mask.ravel()[self.texel], covered.ravel()[self.texel] = seen, True
         return Texture(rgb=_padded(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), covered), seen=mask, covered=covered, exposures=gain)
-
-    def _at(self, values: np.ndarray) -> np.ndarray:
-        """Values (V, …) of the vertices at the texels (N, …)."""
-        return np.asarray(sum(self._shares[:, i].reshape(-1, *[1] * (values.ndim - 1)) * values[self._corners[:, i]] for i in range(3)))
 
     def _keep(self, rows: np.ndarray, rgb: np.ndarray, weight: np.ndarray, view: int) -> None:
         """Put colours in place of the ones with the smallest weights; slots are sorted, largest weight first."""
@@ -188,19 +186,6 @@ class TextureBaker:
             mean = np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True)
             robust = weight / (1 + (np.linalg.norm(rgb - mean[:, None], axis=2) / ROBUST_GREY) ** 2)
         return np.asarray(np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True))
-
-    def _filled(self, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Colours (N, 3) of all texels from a smooth continuation of those that were seen."""
-        from scipy import sparse
-
-        C, _ = laplacian(self._skin.vertices_m, self._skin.faces)
-        nearest = self._corners[np.arange(len(seen)), self._shares.argmax(axis=1)]
-        count = np.bincount(nearest[seen], minlength=len(self._skin.vertices_m))
-        total = np.stack([np.bincount(nearest[seen], colour[seen, k], len(self._skin.vertices_m)) for k in range(3)], axis=1)
-        middle = colour[seen].mean(axis=0) if seen.any() else np.full(3, 127.0)
-        tie = STIFF * (count > 0)
-        right = tie[:, None] * total / np.maximum(count, 1)[:, None] + WEAK * middle
-        return self._at(factorised(sparse.diags(tie + WEAK) - C).solve(right))
 
 
 def _packed(rgb: np.ndarray, view: int) -> np.ndarray:

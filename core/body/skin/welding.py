@@ -18,6 +18,7 @@ import numpy as np
 
 from ..parts import Part
 from .mesh import Skin
+from .packing import packed
 from .whole_surface import WholeSurface
 
 OUTSIDE = 0.5  # a ring is outside the parent part where the parent's field is below this fraction of the limb's
@@ -237,7 +238,7 @@ def _of(number: np.ndarray, pole: int | None) -> int | None:
     return None if pole is None else int(number[pole])
 
 
-MARGIN = 0.01  # between the islands and around them, in texture coordinates
+MARGIN = 0.01  # between the islands and around them, over the side of a square of their area
 
 
 def net_faces(net: Net) -> np.ndarray:
@@ -256,25 +257,16 @@ def _fan(ring: np.ndarray, pole: int | None) -> np.ndarray:
 def face_uv(whole: Welded, ends: Sequence[tuple[float, float]] = ()) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
     """Texture coordinates (F, 4, 2) in the order of the nets' faces, and corner (2,) and size (2,) of islands for `ends`, sizes in metres.
 
-    One island per part, side by side, and those of the ends above them, all at one scale. u runs around the bones, v along them; an island
-    is as wide as its part's mean girth and as high as the part is long.
+    One island per part and end, packed into the square at one scale. u runs around the bones, v along them; an island is as wide as its
+    part's mean girth and as high as the part is long.
     """
-    sizes = [_girth_and_length(whole, net) for net in whole.nets]
-    rows = [row for row in (sizes, list(ends)) if row]
-    scale = min(
-        *((1 - 2 * MARGIN) / (sum(width for width, _ in row) * (1 + MARGIN * len(row))) for row in rows),
-        (1 - (1 + len(rows)) * MARGIN) / sum(max(height for _, height in row) for row in rows),
-    )
-    islands, left = [], MARGIN
-    for net, (width, height) in zip(whole.nets, sizes):
-        uv = _net_uv(net)
-        islands.append(uv * [scale * width, scale * height] + [left, MARGIN])
-        left += scale * width + MARGIN * scale * width
-    charts, left, bottom = [], MARGIN, 2 * MARGIN + scale * max(height for _, height in sizes)
-    for width, height in ends:
-        charts.append((np.array([left, bottom]), scale * np.array([width, height])))
-        left += (1 + MARGIN) * scale * width
-    return np.concatenate(islands), charts
+    sizes = np.array([*(_girth_and_length(whole, net) for net in whole.nets), *ends])
+    gap = MARGIN * np.sqrt(sizes.prod(axis=1).sum())
+    corners, side = packed(sizes + gap)
+    scale = 1 / (side + gap)
+    corners, sizes = (corners + gap) * scale, sizes * scale
+    islands = [_net_uv(net) * size + corner for net, size, corner in zip(whole.nets, sizes, corners)]
+    return np.concatenate(islands), list(zip(corners, sizes))[len(islands) :]
 
 
 def _girth_and_length(whole: Welded, net: Net) -> tuple[float, float]:

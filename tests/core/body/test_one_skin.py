@@ -194,7 +194,7 @@ def test_islands_lie_side_by_side_and_no_face_is_turned_over() -> None:
     assert skin.uv.min() >= 0 and skin.uv.max() <= 1
     a, b = skin.uv[:, 2] - skin.uv[:, 0], skin.uv[:, 3] - skin.uv[:, 1]
     area = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    assert (area > 0).all() and area.sum() < 1
+    assert (area > 0).all() and 0.6 < area.sum() < 1
 
 
 def test_shares_of_the_bones_do_not_jump() -> None:

@@ -72,6 +72,16 @@ def test_a_head_has_the_proportions_of_heads_and_two_equal_sides() -> None:
     assert cKDTree(v).query(v * [-1, 1, 1])[0].max() < 0.1
 
 
+def test_a_mouth_is_no_muzzle() -> None:
+    """Its depth falls evenly to the cheeks, without a step at its corners, and the chin is not far behind the lips."""
+    v = HEAD_MM * head_template().vertices
+    lips = v[(np.abs(v[:, 1] + 8) < 7) & (v[:, 2] > 20)]
+    middle, corner, beside = (lips[np.abs(np.abs(lips[:, 0]) - x) < 4, 2].max() for x in (0, 24, 32))
+    assert middle - corner > 5 and corner - beside < 8
+    chin = v[(np.abs(v[:, 0]) < 5) & (np.abs(v[:, 1] + 41) < 8), 2].max()
+    assert middle - chin < 14
+
+
 def test_a_foot_has_a_heel_five_toes_on_the_floor_and_an_arch() -> None:
     foot = foot_template()
     v = FOOT_MM * foot.vertices

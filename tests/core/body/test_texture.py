@@ -63,7 +63,7 @@ def baked() -> tuple[TextureBaker, Texture]:
 def test_the_paint_is_found_again(baked: tuple[TextureBaker, Texture]) -> None:
     baker, texture = baked
     assert texture.exposures[1] / texture.exposures[0] == pytest.approx(BRIGHTER, rel=0.01)
-    paint = baker._at(PAINT) / texture.exposures[0]
+    paint = baker._texels.at(PAINT) / texture.exposures[0]
     seen = texture.seen.ravel()[baker.texel]
     error = np.abs(texture.rgb.reshape(-1, 3)[baker.texel] - paint).max(axis=1)
     assert 0.2 < seen.mean() < 0.7 and texture.covered.sum() == len(seen)
@@ -96,7 +96,7 @@ def test_a_nearer_surface_hides_and_an_unknown_place_is_not_trusted() -> None:
     baker = TextureBaker(replace(SKIN, relief_m=0 * sigma, sigma_m=sigma), SHAPE, 64, 1)
     baker.add(motion, [filmed(camera, motion, 1.0)])
     seen = baker.finished().seen.ravel()[baker.texel]
-    assert seen.any() and baker._at(sigma)[seen].max() < 0.009
+    assert seen.any() and baker._texels.at(sigma)[seen].max() < 0.009
 
 
 def test_without_any_view_the_texture_is_plain() -> None:
