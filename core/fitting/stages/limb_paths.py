@@ -9,6 +9,10 @@ trunk stays as it was tracked: it is large and hardly ever lost. What is visible
 the best way differs from the tracked poses, it replaces them only if its cost is lower by `LEAST_BETTER`. A limb is followed from the frame
 where the fit begins, and stays there as it was found; one that is not certain there (`FitContext.unsure`) is followed from the first frame
 to the last, and may begin anywhere.
+
+Before that, a limb that had no measured points for some frames is turned evenly from the frame before to the frame after, and followed from
+both, forwards and backwards, to where two ways meet best; what is better stays. A way that only goes forwards drifts while nothing is seen,
+and so does tracking; from there the adjustment would pull along the frames in which the limb is seen again.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +22,8 @@ import numpy as np
 from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..explained import Evidence, limb_gains
-from ..limb import Limb, whole_limbs
+from ..limb import Limb, limbs_of, whole_limbs
+from ..segmentation import segment
 from .pose_tracking import PoseTracking
 
 STAGE = "follow the limbs"
@@ -35,6 +40,8 @@ VELOCITY_KEPT = 0.8
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights
 REPLACED_M = 0.05  # a tracked pose whose limb ends are nearer to the way stays
 LEAST_BETTER = 1.5  # a frame, by which the cost of a way must be lower than that of the tracked poses that it replaces
+
+Way = list[tuple[int, np.ndarray, np.ndarray]]  # frames, with the angles (C,) of a limb and the ends (E, 3) of its bones
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,19 +66,28 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     motion, fit = motion.copy(), given.fit
     if not fit.background.known or not fit.settings.search_limbs:
         return motion
+    limbs = limbs_of(fit.parameters).values()
+    for i, limb in enumerate(limbs):
+        stretches = _unseen(given, motion, limb)
+        for k, (a, b) in enumerate(stretches):
+            part = monitor.part(STAGE, i * len(stretches) + k, 2 * len(limbs) * len(stretches))
+            for way in (_even, _meeting):
+                for t, angles in _better(given, motion, limb, way(given, motion, limb, range(a, b + 1), part), anchored=True).items():
+                    motion[t, limb.columns] = angles
     begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
     runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]
     for i, (limb, begin, frames) in enumerate(runs):
-        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, i, len(runs)))
+        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, len(runs) + i, 2 * len(runs)))
         for t, angles in _better(given, motion, limb, way).items():
             motion[t, limb.columns] = angles
     return motion
 
 
-def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: list[tuple[int, np.ndarray, np.ndarray]]) -> dict[int, np.ndarray]:
+def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, anchored: bool = False) -> dict[int, np.ndarray]:
     """The limb's angles (C,) by frame, where its way differs from a motion (T, D) and costs less, stretch after stretch.
 
-    Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it.
+    Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it; not so a way that is
+    `anchored` in what is seen at both ends.
     """
     angles, tracked = {t: a for t, a, _ in way}, limb.ends(motion, given.first.vector)
     by_way = tracked.copy()
@@ -87,7 +103,7 @@ def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: list[tuple
         around = np.arange(max(stretch[0] - 2, 0), min(stretch[-1] + 3, len(motion)))
         replaced = np.where(np.isin(around, stretch)[:, None, None], by_way[around], tracked[around])
         smoother = _unevenness(tracked[around], given.time_s[around]) - _unevenness(replaced, given.time_s[around])
-        if gain / GAIN + smoother > LEAST_BETTER * len(stretch):
+        if gain / GAIN + smoother > LEAST_BETTER * (1 if anchored else len(stretch)):
             found.update({int(t): angles[int(t)] for t in stretch})
     return found
 
@@ -132,11 +148,61 @@ def _courses(begin: int | None, frames: int) -> list[list[int]]:
     return [list(range(frames))] if begin is None else [list(range(begin, frames)), list(range(begin, -1, -1))]
 
 
-def _best_way(
-    given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """The frames with a limb's angles (C,) and the ends (E, 3) of its bones on its best way: without the first one, where it stays, or with
-    it if it may begin anywhere."""
+def _unseen(given: PoseTracking, motion: np.ndarray, limb: Limb) -> list[tuple[int, int]]:
+    """Between which two frames with them a limb has fewer than `min_points` measured points."""
+    fit, counts = given.fit, []
+    for t, pose in enumerate(motion):
+        owners = segment(given.points[t], given.state(pose), fit.model.surface, fit.settings.gate_m)[1]
+        counts.append(int(np.isin(owners, limb.bones).sum()))
+    seen = [t for t, count in enumerate(counts) if count >= fit.settings.min_points]
+    return [(a, b) for a, b in zip(seen, seen[1:]) if b - a > 1]
+
+
+def _even(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range, monitor: Monitor) -> Way:
+    """The way of a limb that turns evenly between the first and the last of some frames."""
+    between, time_s = [*frames[1:-1]], given.time_s[frames]
+    share = (time_s[1:-1] - time_s[0]) / (time_s[-1] - time_s[0])
+    first, last = motion[[frames[0], frames[-1]]][:, limb.columns]
+    poses = motion[between]
+    poses[:, limb.columns] = first + share[:, None] * (last - first)
+    return list(zip(between, poses[:, limb.columns], limb.ends(poses, given.first.vector)))
+
+
+def _meeting(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range, monitor: Monitor) -> Way:
+    """The way of a limb between the first and the last of some frames, where it stays: of those from both ends the two that meet best."""
+    ahead, back = (_ways(given, motion, limb, [*course], False, monitor) for course in (frames[:-1], frames[:0:-1]))
+    best, place = np.inf, (0, 0, 0)
+    for n, (one, other) in enumerate(zip(ahead, back[::-1])):
+        step_s = float(given.time_s[frames[n + 1]] - given.time_s[frames[n]])
+        expected = one.ends_m + VELOCITY_KEPT * step_s * one.velocity_m_s
+        away = unlikely(other.ends_m[None] - expected[:, None], step_s)
+        total = one.cost[:, None] + other.cost[None] + np.minimum(away, LARGEST_JUMP)
+        if total.min() < best:
+            i, j = np.unravel_index(np.argmin(total), total.shape)
+            best, place = float(total.min()), (n, int(i), int(j))
+    n, i, j = place
+    before = _traced(ahead[: n + 1], [*frames[: n + 1]], i)
+    after = _traced(back[: len(frames) - 1 - n], [*frames[:n:-1]], j)
+    return [*before, *after]
+
+
+def _best_way(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor) -> Way:
+    """A limb's best way: without the first frame, where it stays, or with it if it may begin anywhere."""
+    ways = _ways(given, motion, limb, frames, anywhere, monitor)
+    return _traced(ways, [frames[0], *frames] if anywhere else frames, int(np.argmin(ways[-1].cost)))
+
+
+def _traced(ways: list[_Ways], frames: list[int], k: int) -> Way:
+    """Way k of the last of some frames, without the first one."""
+    found = Way()
+    for t, way in zip(frames[:0:-1], ways[:0:-1]):
+        found.append((t, way.angles[k], way.ends_m[k]))
+        k = int(way.before[k])
+    return found
+
+
+def _ways(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor) -> list[_Ways]:
+    """The ways up to each frame, from the first one's pose, or from anywhere."""
     start, ends = motion[frames[0], limb.columns][None], limb.ends(motion[frames[0]][None], given.first.vector)
     none = np.zeros(1, dtype=np.intp)
     ways = [_Ways(angles=start, ends_m=ends, velocity_m_s=0 * ends, rate=0 * start, cost=np.zeros(1), before=none)]
@@ -146,11 +212,7 @@ def _best_way(
         step_s = abs(float(given.time_s[t] - given.time_s[s]))
         near = given.fit.seen(t, given.points[t]).near(limb, given.state(motion[t]))
         ways.append(_continued(limb, ways[-1], motion[t], given.first.vector, near, step_s))
-    k, found = int(np.argmin(ways[-1].cost)), list[tuple[int, np.ndarray, np.ndarray]]()
-    for (_, t), way in zip(steps[::-1], ways[:0:-1]):
-        found.append((t, way.angles[k], way.ends_m[k]))
-        k = int(way.before[k])
-    return found
+    return ways
 
 
 def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, near: Evidence, step_s: float) -> _Ways:

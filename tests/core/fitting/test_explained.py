@@ -22,7 +22,17 @@ from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.contradicted import ANYWHERE_M, CONTRADICTED, widened
 from tricap.core.fitting.stages.hidden_limbs import reacquired_poses
 from tricap.core.fitting.stages.limb_modes import elsewhere, of_joints
-from tricap.core.fitting.stages.limb_paths import LARGEST_JUMP, _begin, _courses, _unevenness, follow_limbs
+from tricap.core.fitting.stages.limb_paths import (
+    LARGEST_JUMP,
+    _begin,
+    _better,
+    _courses,
+    _even,
+    _meeting,
+    _unevenness,
+    _unseen,
+    follow_limbs,
+)
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.state import free_bones
@@ -199,6 +209,29 @@ def test_an_arm_that_is_not_certain_at_the_start_is_found_by_the_other_frames(fi
     assert _begin(fit, arm) == fit.click
     clicks = SimpleNamespace(joint=np.array([SHAPE.skeleton.joint_names.index("wrist.R")]))
     assert _begin(replace(unsure, clicked={3: clicks}), arm) == 3 and _courses(3, 5) == [[3, 4], [3, 2, 1, 0]]
+
+
+def test_a_limb_without_points_goes_evenly_from_where_it_was_seen_to_where_it_is_seen_next() -> None:
+    bare, time_s = fit_context(_given(FRAMES, []), FitSettings()), np.arange(FRAMES) / 30
+    first = Solution(motion=BEFORE[None], vector=_vector(bare), cost=1.0, scales=Scales(), iterations=1, converged=True)
+    skins = [body_skin(SHAPE, POSES[t]).vertices_m for t in (0, -1)]
+    ends = [CloudPoints(frame=0, xyz_m=X, normals=np.zeros_like(X), sigma_m=np.full(len(X), 1e-3)) for X in skins]
+    points = [ends[0], *[NOTHING] * (FRAMES - 2), ends[1]]
+    tracking = PoseTracking(fit=bare, points=points, time_s=time_s, first=first, tracks=None)
+    (arm,) = [limb for limb in whole_limbs(bare.parameters) if NAMES[limb.bones[0]] == "upper_arm.R"]
+    astray = np.array([POSES[0], *[_raised(130.0)] * (FRAMES - 2), POSES[-1]])
+    assert _unseen(tracking, astray, arm) == [(0, FRAMES - 1)]
+    way = _even(tracking, astray, arm, range(FRAMES), Monitor())
+    assert [t for t, _, _ in way] == [1, 2, 3]
+    even = astray.copy()
+    for t, angles, _ in way:
+        even[t, arm.columns] = angles
+    assert np.allclose(even[:, arm.columns], POSES[:, arm.columns])
+    assert _better(tracking, astray, arm, way, anchored=True).keys() == {1, 2, 3}
+    assert not _better(tracking, even, arm, way, anchored=True)  # what is as even stays
+    meeting = _meeting(tracking, astray, arm, range(FRAMES), Monitor())  # half of it from each end
+    assert sorted(t for t, _, _ in meeting) == [1, 2, 3] and _better(tracking, astray, arm, meeting, anchored=True)
+    assert not _better(tracking, even, arm, meeting, anchored=True)
 
 
 def test_nothing_is_followed_where_no_background_is_known(fit) -> None:
