@@ -86,8 +86,8 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
 def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, anchored: bool = False) -> dict[int, np.ndarray]:
     """The limb's angles (C,) by frame, where its way differs from a motion (T, D) and costs less, stretch after stretch.
 
-    Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it; not so a way that is
-    `anchored` in what is seen at both ends.
+    Where nothing is visible of a limb, its way follows accidental evidence, while tracking has predicted it. That a way is more even,
+    however, is no accident where it is `anchored` in what is seen at both ends.
     """
     angles, tracked = {t: a for t, a, _ in way}, limb.ends(motion, given.first.vector)
     by_way = tracked.copy()
@@ -103,7 +103,8 @@ def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, ancho
         around = np.arange(max(stretch[0] - 2, 0), min(stretch[-1] + 3, len(motion)))
         replaced = np.where(np.isin(around, stretch)[:, None, None], by_way[around], tracked[around])
         smoother = _unevenness(tracked[around], given.time_s[around]) - _unevenness(replaced, given.time_s[around])
-        if gain / GAIN + smoother > LEAST_BETTER * (1 if anchored else len(stretch)):
+        evener = anchored and smoother + min(gain, 0.0) / GAIN > LEAST_BETTER
+        if evener or gain / GAIN + smoother > LEAST_BETTER * len(stretch):
             found.update({int(t): angles[int(t)] for t in stretch})
     return found
 
