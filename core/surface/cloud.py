@@ -8,7 +8,8 @@ With weights w_i ∝ 1 / tr K_i, Σ w_i = 1,
 
     X = Σ w_i X_i ,   K = Σ w_i K_i                                                                  (1)
 
-The patches of neighbouring points overlap, so that their errors are correlated: K is the upper limit, that of fully dependent points.
+The patches of neighbouring points overlap, so that their errors are correlated: K is the upper limit, that of fully dependent points. A
+centre of gravity counts as extended if half of its weight or more is that of extended points.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -70,6 +71,7 @@ class PointCloud:
     intensity: np.ndarray  # (N,) grey value in the reference view
     xy_px: np.ndarray  # (N, K, 2) where the points were matched
     residual_px: np.ndarray  # (N,) RMS by which the rays miss each other
+    extended: np.ndarray  # (N,) measured from the surface of the neighbours, where texture is weak (matching/extension.py)
 
     def __post_init__(self) -> None:
         n, k = len(self.xyz_m), self.xy_px.shape[1]
@@ -77,6 +79,7 @@ class PointCloud:
             xyz_m=(n, 3), covariance_m2=(n, 3, 3), normals=(n, 3), intensity=(n,), xy_px=(n, k, 2), residual_px=(n,)
         ).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+        object.__setattr__(self, "extended", frozen(self.extended, (n,), bool, "extended"))
 
     @property
     def sigma_m(self) -> np.ndarray:
@@ -133,6 +136,7 @@ def point_cloud(field: MatchedField, grey: np.ndarray, camera: Camera, reference
         intensity=grey[pixel[:, 1], pixel[:, 0]],
         xy_px=field.grid.rows.to_frame(field.xy).reshape(n, k, 2),
         residual_px=field.residual_px,
+        extended=field.extended,
     )
 
 
@@ -192,9 +196,18 @@ def voxel_filtered(cloud: PointCloud, edge_m: float, fewest: int) -> PointCloud:
         intensity=mean(cloud.intensity),
         xy_px=mean(cloud.xy_px),
         residual_px=mean(cloud.residual_px),
+        extended=mean(cloud.extended.astype(np.float64)) >= 0.5,
     )
 
 
 def write_cloud(path: Path, cloud: PointCloud) -> None:
     """Write a cloud as clouds/NNNN.ply (docs/formats.md), whole or not at all."""
-    ply.write_cloud(path, xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity, rays=cloud.rays)
+    ply.write_cloud(
+        path,
+        xyz_m=cloud.xyz_m,
+        sigma_m=cloud.sigma_m,
+        normals=cloud.normals,
+        intensity=cloud.intensity,
+        rays=cloud.rays,
+        extended=cloud.extended,
+    )

@@ -25,6 +25,7 @@ from ..take.footage import Footage
 from .cloud import OCCLUDED, PointCloud, point_cloud, why_removed
 from .starts import FrameStart, FrameStarts, FrameViews, MeasureSettings, frame_views, read_start
 
+OF_CLOUDS_FIELD = ("xy_px", "residual_px", "extended")  # of a cloud, which a checkpoint stores with its field
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")  # stored in single precision
 
 
@@ -152,7 +153,7 @@ def _single(field: MatchedField) -> MatchedField:
 def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
     arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(MatchedField) if f.name not in OF_FIELD}
     arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
-    arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
+    arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", *OF_CLOUDS_FIELD)}
     arrays |= {
         "where": np.array(m.foreground.depth_range_m),
         "planes": m.foreground.planes,
@@ -207,6 +208,7 @@ def _measured(footage: Footage, frame: int, key: str, a: dict[str, np.ndarray]) 
         frame=frame,
         xy_px=rows.to_frame(field.xy),
         residual_px=field.residual_px,
+        extended=field.extended,
         **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")},
     )
     where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])

@@ -37,6 +37,7 @@ def empty_clouds(footage: Footage) -> list[PointCloud]:
             intensity=np.zeros(0),
             xy_px=np.zeros((0, views, 2)),
             residual_px=np.zeros(0),
+            extended=np.zeros(0, dtype=bool),
         )
         for frame in footage.frames
     ]

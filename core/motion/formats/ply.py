@@ -1,7 +1,8 @@
 """PLY files, binary little-endian: clouds and meshes, written atomically; input is validated.
 
-A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32, and optionally rays, a uchar: the number of
-views in which each point was measured. A mesh has x y z and faces, each a list (uchar count, int indices). World coordinates.
+A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32, and optionally two uchars: rays, the number
+of views in which each point was measured, and extended, 1 where it was measured from the surface of its neighbours. A mesh has x y z and
+faces, each a list (uchar count, int indices). World coordinates.
 Format: G. Turk, The PLY Polygon File Format, 1994.
 """
 
@@ -60,16 +61,25 @@ class Ply:
 
 
 def write_cloud(
-    path: Path, *, xyz_m: np.ndarray, sigma_m: np.ndarray, normals: np.ndarray, intensity: np.ndarray, rays: np.ndarray | None = None
+    path: Path,
+    *,
+    xyz_m: np.ndarray,
+    sigma_m: np.ndarray,
+    normals: np.ndarray,
+    intensity: np.ndarray,
+    rays: np.ndarray | None = None,
+    extended: np.ndarray | None = None,
 ) -> None:
-    """Write a cloud of N points: positions (N, 3), their mean sigma (N,), unit normals (N, 3), grey values (N,), numbers of rays (N,).
+    """Write a cloud of N points: positions (N, 3), their mean sigma (N,), unit normals (N, 3), grey values (N,), numbers of rays (N,), and
+    which points are extended (N,).
 
     Raises:
         InputError: the file cannot be written.
     """
     names = ("x", "y", "z", "sigma", "nx", "ny", "nz", "intensity")
     columns = dict(zip(names, np.column_stack([xyz_m, sigma_m, normals, intensity]).astype("<f4").T))
-    _write_points(path, columns if rays is None else columns | {"rays": np.asarray(rays, dtype=np.uint8)})
+    more = {"rays": rays, "extended": extended}
+    _write_points(path, columns | {name: np.asarray(values, dtype=np.uint8) for name, values in more.items() if values is not None})
 
 
 def write_tracked(path: Path, *, xyz_m: np.ndarray, sigma_m: np.ndarray, velocity_m_s: np.ndarray, track: np.ndarray) -> None:

@@ -87,7 +87,7 @@ def test_clouds_are_completed_where_the_person_is_and_nothing_was_measured(scene
     measured = np.array([[0.0, 0.0, STRIP_M]])
     cloud = PointCloud(
         frame=0, xyz_m=measured, covariance_m2=np.eye(3)[None] * 1e-6, normals=-np.eye(3)[2:], intensity=np.zeros(1),
-        xy_px=np.zeros((1, 3, 2)), residual_px=np.zeros(1),
+        xy_px=np.zeros((1, 3, 2)), residual_px=np.zeros(1), extended=np.zeros(1),
     )  # fmt: skip
     shown = scenes.render(rig["C"], _bodies(scenes)[1:], background=-1.0) >= 0  # the strip is the person
     distance = Packed([np.where(shown, 0, 9)])

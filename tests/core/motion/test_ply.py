@@ -27,6 +27,13 @@ def test_cloud_round_trip(tmp_path: Path, n: int) -> None:
     assert back.faces.shape == (0, 3) and list((tmp_path / "a").iterdir()) == [tmp_path / "a" / "0000.ply"]
 
 
+def test_more_of_a_cloud_follows_what_every_cloud_has(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "0000.ply", **cloud(3), rays=np.array([3, 2, 3]), extended=np.array([False, True, False]))
+    back = read_ply(tmp_path / "0000.ply").vertex
+    assert list(back) == ["x", "y", "z", "sigma", "nx", "ny", "nz", "intensity", "rays", "extended"]
+    assert back["rays"].tolist() == [3, 2, 3] and back["extended"].tolist() == [0, 1, 0]
+
+
 @pytest.mark.parametrize("corners", [3, 4])
 def test_mesh_round_trip(tmp_path: Path, corners: int) -> None:
     vertices = np.random.default_rng(1).normal(size=(50, 3))

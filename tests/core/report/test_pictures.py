@@ -59,7 +59,7 @@ def cloud(n: int) -> PointCloud:
     random = np.random.default_rng(0)
     return PointCloud(frame=0, xyz_m=random.uniform(-0.1, 0.1, (n, 3)) + [0, 0, 2.16], covariance_m2=np.tile(np.eye(3) * 1e-6, (n, 1, 1)),
                       normals=np.tile([0, 0, -1.0], (n, 1)), intensity=np.full(n, 100), xy_px=random.uniform(0, 150, (n, 3, 2)),
-                      residual_px=np.zeros(n))  # fmt: skip
+                      residual_px=np.zeros(n), extended=np.zeros(n))  # fmt: skip
 
 
 @pytest.mark.parametrize("n", [0, 1, 50])

@@ -92,10 +92,11 @@ def test_clouds_and_trajectories(tmp_path: Path) -> None:
     random, results = np.random.default_rng(0), Results(tmp_path)
     K = np.tile(np.diag([1e-6, 4e-6, 4e-6]), (5, 1, 1))
     cloud = PointCloud(frame=7, xyz_m=random.standard_normal((5, 3)), covariance_m2=K, normals=np.tile([0, 0, -1.0], (5, 1)),
-                       intensity=np.arange(5), xy_px=np.zeros((5, 3, 2)), residual_px=np.zeros(5))  # fmt: skip
+                       intensity=np.arange(5), xy_px=np.zeros((5, 3, 2)), residual_px=np.zeros(5), extended=[0, 1, 0, 1, 1])  # fmt: skip
     write_cloud(results.cloud_path(cloud.frame), cloud)
     ply = read_ply(tmp_path / "clouds" / "0007.ply")
     assert np.allclose(ply.xyz_m, cloud.xyz_m, atol=1e-6) and np.allclose(ply.vertex["sigma"], 3e-3)
+    assert ply.vertex["extended"].dtype == np.uint8 and ply.vertex["extended"].tolist() == [0, 1, 0, 1, 1]
     xyz = random.standard_normal((3, 4, 3))
     xyz[0, 1] = np.nan
     sigma = np.where(np.isnan(xyz[..., 0]), np.nan, 1e-3)

@@ -156,7 +156,7 @@ def test_nothing_is_measured_on_what_has_no_texture(tmp_path: Path, scenes: Any)
 def test_clouds_and_fields_of_nothing(scenes: Any) -> None:
     z = np.zeros
     empty = PointCloud(frame=0, xyz_m=z((0, 3)), covariance_m2=z((0, 3, 3)), normals=z((0, 3)), intensity=z(0),
-                       xy_px=z((0, 3, 2)), residual_px=z(0))  # fmt: skip
+                       xy_px=z((0, 3, 2)), residual_px=z(0), extended=z(0))  # fmt: skip
     assert empty.sigma_m.shape == (0,)
     with pytest.raises(ValueError):
         empty.xyz_m[...] = 1

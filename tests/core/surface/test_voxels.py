@@ -24,7 +24,7 @@ def scattered(random: np.random.Generator, n: int = 4000) -> PointCloud:
     seen = np.ones((n, 3, 2))
     seen[::50, 2] = np.nan
     return PointCloud(frame=3, xyz_m=xyz, covariance_m2=K, normals=np.tile([0, 0, -1.0], (n, 1)), intensity=np.full(n, 90.0), xy_px=seen,
-                      residual_px=np.zeros(n))  # fmt: skip
+                      residual_px=np.zeros(n), extended=np.arange(n) % 2)  # fmt: skip
 
 
 def test_the_centre_of_gravity_and_its_sigma() -> None:
@@ -36,6 +36,7 @@ def test_the_centre_of_gravity_and_its_sigma() -> None:
     assert error.std() < 3e-4  # the poor half hardly counts
     assert 0.7 < (error / np.sqrt(thin.covariance_m2[:, 2, 2])).std() < 1.3
     assert np.allclose(thin.normals, (0, 0, -1)) and np.allclose(thin.intensity, 90)
+    assert cloud.extended.mean() == 0.5 and not thin.extended.any()  # the poor half is the extended one
     pair = np.unique(np.floor(cloud.xyz_m[::50] / EDGE_M).astype(int), axis=0)
     assert ((thin.rays == 2) == (cubes[:, None] == pair).all(axis=2).any(axis=1)).all()
 

@@ -65,7 +65,7 @@ def test_a_region_leaves_gaps_and_removes_the_points_of_the_clouds() -> None:
     assert np.array_equal(filtered.kept.visible, ~gone) and np.array_equal(filtered.kept.status == TrackStatus.REMOVED_BY_USER, gone)
     n = raw.visible.shape[1]
     cloud = PointCloud(frame=4, xyz_m=raw.xyz_m[4], covariance_m2=np.tile(np.eye(3), (n, 1, 1)), normals=np.zeros((n, 3)),
-                       intensity=np.arange(n), xy_px=np.zeros((n, 1, 2)), residual_px=np.zeros(n))  # fmt: skip
+                       intensity=np.arange(n), xy_px=np.zeros((n, 1, 2)), residual_px=np.zeros(n), extended=np.zeros(n))  # fmt: skip
     assert np.array_equal(corrected_cloud(cloud, take_out, RIG).intensity, np.flatnonzero(~gone[4]))
     assert corrected_cloud(replace(cloud, frame=7), take_out, RIG).intensity.size == n
 
