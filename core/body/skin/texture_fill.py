@@ -63,9 +63,11 @@ def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
     head = texels.at(skin.weights[:, [name == HEAD for name in skin.bone_names]].sum(axis=1)) > HEADS
     face = np.where(head, -1, 2 * skin.part[texels.vertex] + (normals @ texels.ahead > 0))
     of_vertices = _nearest_texels(texels)
-    ways: list[Sources] = [] if skin.rays else [partial(_other_side, places, normals)]
+    ways: list[Sources] = [partial(_other_face, from_ahead, face)]
+    if not skin.rays:
+        ways.insert(0, partial(_other_side, places, normals))
     found, known = colour.copy(), seen.copy()
-    for sources in (*ways, partial(_other_face, from_ahead, face)):
+    for sources in ways:
         rows = np.flatnonzero(known)
         wanted, common = np.flatnonzero(~known), of_vertices[known[of_vertices]]
         source, check = sources(rows, wanted), sources(rows, common)

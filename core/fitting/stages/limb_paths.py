@@ -69,18 +69,22 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     limbs = limbs_of(fit.parameters).values()
     for i, limb in enumerate(limbs):
         stretches = _unseen(given, motion, limb)
-        for k, (a, b) in enumerate(stretches):
+        for k, frames in enumerate(stretches):
             part = monitor.part(STAGE, i * len(stretches) + k, 2 * len(limbs) * len(stretches))
-            for way in (_even, _meeting):
-                for t, angles in _better(given, motion, limb, way(given, motion, limb, range(a, b + 1), part), anchored=True).items():
-                    motion[t, limb.columns] = angles
+            _put(given, motion, limb, _even(given, motion, limb, frames), anchored=True)
+            _put(given, motion, limb, _meeting(given, motion, limb, frames, part), anchored=True)
     begins = [(limb, _begin(fit, limb)) for limb in whole_limbs(fit.parameters)]
-    runs = [(limb, begin, frames) for limb, begin in begins for frames in _courses(begin, len(motion)) if len(frames) > 1]
-    for i, (limb, begin, frames) in enumerate(runs):
-        way = _best_way(given, motion, limb, frames, begin is None, monitor.part(STAGE, len(runs) + i, 2 * len(runs)))
-        for t, angles in _better(given, motion, limb, way).items():
-            motion[t, limb.columns] = angles
+    runs = [(limb, begin, course) for limb, begin in begins for course in _courses(begin, len(motion)) if len(course) > 1]
+    for i, (limb, begin, course) in enumerate(runs):
+        part = monitor.part(STAGE, len(runs) + i, 2 * len(runs))
+        _put(given, motion, limb, _best_way(given, motion, limb, course, begin is None, part))
     return motion
+
+
+def _put(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, *, anchored: bool = False) -> None:
+    """Put a limb on its way in a motion (T, D), where that is better."""
+    for t, angles in _better(given, motion, limb, way, anchored=anchored).items():
+        motion[t, limb.columns] = angles
 
 
 def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, anchored: bool = False) -> dict[int, np.ndarray]:
@@ -149,17 +153,17 @@ def _courses(begin: int | None, frames: int) -> list[list[int]]:
     return [list(range(frames))] if begin is None else [list(range(begin, frames)), list(range(begin, -1, -1))]
 
 
-def _unseen(given: PoseTracking, motion: np.ndarray, limb: Limb) -> list[tuple[int, int]]:
-    """Between which two frames with them a limb has fewer than `min_points` measured points."""
+def _unseen(given: PoseTracking, motion: np.ndarray, limb: Limb) -> list[range]:
+    """Stretches of frames in which a limb has fewer than `min_points` measured points, each with the frame before and the one after."""
     fit, counts = given.fit, []
     for t, pose in enumerate(motion):
         owners = segment(given.points[t], given.state(pose), fit.model.surface, fit.settings.gate_m)[1]
         counts.append(int(np.isin(owners, limb.bones).sum()))
     seen = [t for t, count in enumerate(counts) if count >= fit.settings.min_points]
-    return [(a, b) for a, b in zip(seen, seen[1:]) if b - a > 1]
+    return [range(a, b + 1) for a, b in zip(seen, seen[1:]) if b - a > 1]
 
 
-def _even(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range, monitor: Monitor) -> Way:
+def _even(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range) -> Way:
     """The way of a limb that turns evenly between the first and the last of some frames."""
     between, time_s = [*frames[1:-1]], given.time_s[frames]
     share = (time_s[1:-1] - time_s[0]) / (time_s[-1] - time_s[0])
@@ -179,8 +183,7 @@ def _meeting(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range,
         away = unlikely(other.ends_m[None] - expected[:, None], step_s)
         total = one.cost[:, None] + other.cost[None] + np.minimum(away, LARGEST_JUMP)
         if total.min() < best:
-            i, j = np.unravel_index(np.argmin(total), total.shape)
-            best, place = float(total.min()), (n, int(i), int(j))
+            best, place = float(total.min()), (n, *divmod(int(np.argmin(total)), total.shape[1]))
     n, i, j = place
     before = _traced(ahead[: n + 1], [*frames[: n + 1]], i)
     after = _traced(back[: len(frames) - 1 - n], [*frames[:n:-1]], j)
