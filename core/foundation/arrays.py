@@ -1,16 +1,28 @@
 """Read-only arrays: the values that flow between the stages cannot be changed behind anybody's back.
 
+Values of arrays that belong together row by row: some of their rows, or several values one after the other.
+
 A sequence whose items are made when they are asked for and not kept, so that a long recording is never held in memory.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar, overload
+from dataclasses import fields
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 
 from .errors import InputError
 
 LEAST_CELLS, SPARSEST = 1_000_000, 20  # cells of a table: so many in any case, and so many for every one that is known
+
+
+class _OfArrays(Protocol):
+    """A dataclass; here, of arrays."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Rows = TypeVar("Rows", bound=_OfArrays)
 
 
 def frozen(array: Any, shape: Sequence[int | None], dtype: Any = np.float64, name: str = "array") -> np.ndarray:
@@ -27,6 +39,16 @@ def frozen(array: Any, shape: Sequence[int | None], dtype: Any = np.float64, nam
         raise ValueError(f"{name} has shape {copy.shape}, expected {tuple(shape)}")
     copy.flags.writeable = False
     return copy
+
+
+def select_rows(value: Rows, rows: Any) -> Rows:
+    """A dataclass of arrays with only these rows (a mask, indices, a slice, or several of these for as many axes), contiguous."""
+    return type(value)(**{f.name: np.ascontiguousarray(getattr(value, f.name)[rows]) for f in fields(value)})
+
+
+def concatenated(values: Sequence[Rows], axis: int = 0) -> Rows:
+    """Dataclasses of arrays, at least one, as one: their arrays one after the other along an axis."""
+    return type(values[0])(**{f.name: np.concatenate([getattr(v, f.name) for v in values], axis) for f in fields(values[0])})
 
 
 def check_sparse(rows: int, frames: int, names: int, where: object) -> None:

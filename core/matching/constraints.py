@@ -15,11 +15,12 @@ variance (of a first adjustment in which these shifts are free). Where σ_c is l
 is returned as it was matched.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
+from ..foundation.arrays import concatenated
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
@@ -111,7 +112,7 @@ def fit_neighbours(
         return _fitted(neighbour[rows], xy, values, query_xy[rows], degree, min_scale[rows], radius_px)
 
     parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST))
-    return PolynomialFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(PolynomialFit)})
+    return concatenated(parts)
 
 
 def _fitted(

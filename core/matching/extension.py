@@ -11,10 +11,11 @@ a cell. A cell beyond the body's outline would be matched by the texture at its 
 its texture, without the noise, lies near its cell. Larger patches would not help: a limb is hardly wider than they are (docs/decisions.md).
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
+from ..foundation.arrays import select_rows
 from ..foundation.progress import Monitor
 from ..geometry.robust import PolynomialFit
 from .constraints import (
@@ -80,7 +81,7 @@ def _measured(field: MatchedField, cell: np.ndarray, views: Views, settings: Mat
     if not len(good):
         return None
     cell, visible = cell[good], visible[good]
-    around = PolynomialFit(**{f.name: getattr(around, f.name)[good] for f in fields(around)})
+    around = select_rows(around, good)
     speed = px_per_inverse_metre(views)
     wide = replace(
         settings,

@@ -33,10 +33,10 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
+from ..foundation.arrays import concatenated, select_rows
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
 from ..foundation.threads import equal_pieces, in_threads
@@ -124,10 +124,6 @@ class Matches:
     parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture does not determine the shape
     status: np.ndarray  # (N,) MatchStatus
 
-    def select(self, rows: slice) -> "Matches":
-        """Only these patches."""
-        return Matches(**{name: getattr(self, name)[rows] for name in Matches.__dataclass_fields__})
-
     @property
     def transfer_xy(self) -> np.ndarray:
         """(N, 2) position of the texture's centre of gravity, x_o of (5)."""
@@ -187,7 +183,7 @@ def match_patches(
         return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches], needed)
 
     parts = in_threads(work, _pieces(n))
-    return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
+    return [concatenated([part[k] for part in parts]) for k in range(len(searches))]
 
 
 def prepare_templates(template: TemplatePoints, settings: MatchingSettings) -> "PatchTemplates":
@@ -202,17 +198,11 @@ def match_prepared(templates: "PatchTemplates", rows: np.ndarray, search: Search
     def work(span: slice) -> Matches:
         return templates.select(span if all_in_order else rows[span]).find([search.select(span)])[0]
 
-    return join_matches(in_threads(work, _pieces(len(rows))))
+    return concatenated(in_threads(work, _pieces(len(rows))))
 
 
 def _pieces(n: int) -> list[slice]:
     return equal_pieces(n, LARGEST, SHARED_FROM)
-
-
-def join_matches(parts: Sequence[Matches]) -> Matches:
-    """The matches of all parts, one after the other."""
-    names = Matches.__dataclass_fields__
-    return Matches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
 class PatchTemplates:
@@ -322,17 +312,13 @@ class PatchTemplates:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Found:
-    """Where the iterations are with N patches in S images: the first two axes of every array, or the only ones after `at`."""
+    """Where the iterations are with N patches in S images: the first two axes of every array; of one image without the first."""
 
     c: np.ndarray  # (S, N, 2)
     A: np.ndarray  # (S, N, 2, 2)
     status: np.ndarray  # (S, N) MatchStatus
     correlation: np.ndarray  # (S, N)
     iterations: np.ndarray  # (S, N)
-
-    def at(self, rows: Any) -> "_Found":
-        """Only these rows of the arrays."""
-        return _Found(**{f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(_Found)})
 
 
 class Matching:
@@ -362,8 +348,7 @@ class Matching:
         else:
             new = {name: np.concatenate([getattr(self, name), a], axis=1) for name, a in new.items()}
             self._templates = PatchTemplates.joined([self._templates, templates])
-            both = {f.name: np.concatenate([getattr(self._found, f.name), getattr(found, f.name)], axis=1) for f in fields(_Found)}
-            self._found = _Found(**both)
+            self._found = concatenated([self._found, found], axis=1)
         self._start, self._shape, self._alive = (new[name] for name in ("_start", "_shape", "_alive"))
 
     def advance(self, share: float = 0.0) -> None:
@@ -411,12 +396,12 @@ class Matching:
         assert self._templates is not None
         done = ~self._alive.any(axis=0)
         own = self._templates if done.all() else self._templates.select(done, JUDGED)
-        matches = [
-            own.judged(SearchImage(image=image, start=self._start[k, done], shape=self._shape[k, done]), self._found.at((k, done)))
-            for k, image in enumerate(self._images)
+        searches = [
+            SearchImage(image=image, start=self._start[k, done], shape=self._shape[k, done]) for k, image in enumerate(self._images)
         ]
+        matches = [own.judged(search, select_rows(self._found, (k, done))) for k, search in enumerate(searches)]
         self._templates = None if done.all() else self._templates.select(~done)
-        self._found, self._alive = self._found.at((slice(None), ~done)), np.ascontiguousarray(self._alive[:, ~done])
+        self._found, self._alive = select_rows(self._found, np.s_[:, ~done]), np.ascontiguousarray(self._alive[:, ~done])
         self._start, self._shape = self._start[:, ~done], self._shape[:, ~done]
         return done, matches
 

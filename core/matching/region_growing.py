@@ -10,10 +10,11 @@ and a point is accepted only if enough views match it, its rays meet, and its de
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count, product
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
+from ..foundation.arrays import concatenated, select_rows
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
 from ..geometry.camera import Camera
@@ -235,14 +236,6 @@ class Front:
     shape: np.ndarray  # (n, K, 2, 2)
     parent_depth_m: np.ndarray  # (n,) depth that the point should continue; NaN for seeds, which have no parent
 
-    def select(self, rows: np.ndarray) -> "Front":
-        """Only these rows (a mask or indices)."""
-        return Front(cell=self.cell[rows], start=self.start[rows], shape=self.shape[rows], parent_depth_m=self.parent_depth_m[rows])
-
-    def joined(self, other: "Front") -> "Front":
-        """The cells of both, one after the other."""
-        return Front(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Front)})
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Measured:
@@ -254,7 +247,9 @@ class _Measured:
 
     def select(self, rows: np.ndarray) -> "_Measured":
         """Only these rows (a mask)."""
-        return _Measured(matched=[_rows(m, rows) for m in self.matched], point=_rows(self.point, rows), depth_m=self.depth_m[rows])
+        return _Measured(
+            matched=[select_rows(m, rows) for m in self.matched], point=select_rows(self.point, rows), depth_m=self.depth_m[rows]
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -325,11 +320,11 @@ class _Growth:
             front = cells.next_front(np.flatnonzero(cells.accepted), none, attempts, self._base)
             front = _joined(cells, seeds, front) if with_seeds else front
         matching = Matching([views.images[k] for k in views.search], this.matching, required)
-        at_work = front.select(none)
+        at_work = select_rows(front, none)
         for step in count():
             if len(front.cell):
                 cells.begin(front, step)
-                at_work = at_work.joined(front)
+                at_work = concatenated([at_work, front])
                 template = TemplatePoints(image=views.template, xy=self._grid.xy(front.cell), row_step=views.rows.step)
                 start, shape = front.start[:, views.search].swapaxes(0, 1), front.shape[:, views.search].swapaxes(0, 1)
                 matching.add(PatchTemplates(template, this.matching), start, shape)
@@ -338,11 +333,11 @@ class _Growth:
             self._monitor.step("surface", int(cells.accepted.sum()), len(cells.accepted))
             matching.advance(AT_WORK)
             done, matched = matching.take()
-            front, at_work = at_work.select(done), at_work.select(~done)
+            front, at_work = select_rows(at_work, done), select_rows(at_work, ~done)
             cells.moving[front.cell] = False
             measured = _intersected(views, self._grid.xy(front.cell), matched, self._rig_sigma_px, required)
             good = self._acceptable(measured, front.parent_depth_m, required)
-            accepted = front.select(good)
+            accepted = select_rows(front, good)
             cells.accept(accepted, measured.select(good), views, step)
             cells.smoothed[accepted.cell] = this.smoothed
             front = cells.next_front(accepted.cell, front.cell[~good], attempts, self._base)
@@ -403,7 +398,7 @@ def _joined(cells: _Cells, seeds: Front, front: Front) -> Front:
     """The seeds that are not yet accepted, and the rest of a front."""
     fresh = ~cells.accepted[seeds.cell]
     rest = ~np.isin(front.cell, seeds.cell[fresh])
-    return seeds.select(fresh).joined(front.select(rest))
+    return concatenated([select_rows(seeds, fresh), select_rows(front, rest)])
 
 
 def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Front:
@@ -440,11 +435,3 @@ def _intersected(views: Views, xy: np.ndarray, matched: list[Matches], rig_sigma
 def _enough(matched: Sequence[Matches], required: int) -> np.ndarray:
     """(N,) whether as many views match the point as are required."""
     return np.asarray(np.sum([m.ok for m in matched], axis=0) >= required)
-
-
-PerPoint = TypeVar("PerPoint", Matches, Intersection)
-
-
-def _rows(values: PerPoint, rows: np.ndarray) -> PerPoint:
-    """A value of arrays per point with only these rows (a mask)."""
-    return type(values)(**{f.name: getattr(values, f.name)[rows] for f in fields(values)})

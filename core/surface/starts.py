@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..foundation import store
+from ..foundation.arrays import concatenated, select_rows
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.threads import in_threads
@@ -288,7 +289,7 @@ def _first_foreground(now: FrameViews, settings: MeasureSettings, monitor: Monit
         outside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=now.silhouettes).excludes(
             xyz, np.zeros((len(xyz), 3, 3))
         )
-        return Approximations(**{f.name: getattr(found, f.name)[~outside] for f in fields(Approximations)})
+        return select_rows(found, ~outside)
 
     planes, moving = _background_and_person(now, sweep(None))
     depth = np.array([clicked_depth(footage, name, at) for name, at in take.clicks.named])
@@ -306,7 +307,7 @@ def _first_foreground(now: FrameViews, settings: MeasureSettings, monitor: Monit
     seeds = sweep(where.depth_range_m)
     if take.clicks.surface and now.frame == take.clicks.frame:
         clicked = clicked_seeds(footage, now.views, settings.matching)
-        seeds = Approximations(**{f.name: np.concatenate([getattr(s, f.name) for s in (seeds, clicked)]) for f in fields(Approximations)})
+        seeds = concatenated([seeds, clicked])
     return where, seeds
 
 

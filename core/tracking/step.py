@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..foundation.arrays import concatenated, select_rows
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
@@ -36,7 +37,6 @@ from ..matching.least_squares import (
     PatchTemplates,
     SearchImage,
     TemplatePoints,
-    join_matches,
     match_patches,
 )
 from ..matching.patches import patch_offsets
@@ -226,10 +226,10 @@ def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray
         matching = Matching(images.next_spline, view.matching)
         matching.add(PatchTemplates.joined(templates), begin.reshape(K, K * m, 2), np.tile(np.eye(2), (K, K * m, 1, 1)))
         matching.advance()
-        return [matches.select(slice(k * m, (k + 1) * m)) for k, matches in enumerate(matching.take()[1])]
+        return [select_rows(matches, np.s_[k * m : (k + 1) * m]) for k, matches in enumerate(matching.take()[1])]
 
     parts = in_threads(match, equal_pieces(n, max(1, n), SHARED_FROM))
-    temporal = [join_matches([part[k] for part in parts]) for k in range(K)]
+    temporal = [concatenated([part[k] for part in parts]) for k in range(K)]
     for k, m in enumerate(temporal):
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
     return temporal

@@ -66,9 +66,9 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     motion, fit = motion.copy(), given.fit
     if not fit.background.known or not fit.settings.search_limbs:
         return motion
-    limbs = limbs_of(fit.parameters).values()
+    limbs, points = limbs_of(fit.parameters).values(), _points_of_bones(given, motion)
     for i, limb in enumerate(limbs):
-        stretches = _unseen(given, motion, limb)
+        stretches = _stretches(points[:, limb.bones].sum(axis=1) >= fit.settings.min_points)
         for k, frames in enumerate(stretches):
             part = monitor.part(STAGE, i * len(stretches) + k, 2 * len(limbs) * len(stretches))
             _put(given, motion, limb, _even(given, motion, limb, frames), anchored=True)
@@ -153,14 +153,17 @@ def _courses(begin: int | None, frames: int) -> list[list[int]]:
     return [list(range(frames))] if begin is None else [list(range(begin, frames)), list(range(begin, -1, -1))]
 
 
-def _unseen(given: PoseTracking, motion: np.ndarray, limb: Limb) -> list[range]:
-    """Stretches of frames in which a limb has fewer than `min_points` measured points, each with the frame before and the one after."""
-    fit, counts = given.fit, []
-    for t, pose in enumerate(motion):
-        owners = segment(given.points[t], given.state(pose), fit.model.surface, fit.settings.gate_m)[1]
-        counts.append(int(np.isin(owners, limb.bones).sum()))
-    seen = [t for t, count in enumerate(counts) if count >= fit.settings.min_points]
-    return [range(a, b + 1) for a, b in zip(seen, seen[1:]) if b - a > 1]
+def _points_of_bones(given: PoseTracking, motion: np.ndarray) -> np.ndarray:
+    """How many measured points each bone has in each frame (T, B) of a motion (T, D)."""
+    fit = given.fit
+    owners = (segment(points, given.state(pose), fit.model.surface, fit.settings.gate_m)[1] for points, pose in zip(given.points, motion))
+    return np.array([np.bincount(bones, minlength=len(fit.model.skeleton.bones)) for bones in owners])
+
+
+def _stretches(seen: np.ndarray) -> list[range]:
+    """Stretches of frames that are not `seen` (T,), each with the seen frame before and the one after."""
+    frames = np.flatnonzero(seen).tolist()
+    return [range(a, b + 1) for a, b in zip(frames, frames[1:]) if b - a > 1]
 
 
 def _even(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range) -> Way:

@@ -29,8 +29,9 @@ from tricap.core.fitting.stages.limb_paths import (
     _courses,
     _even,
     _meeting,
+    _points_of_bones,
+    _stretches,
     _unevenness,
-    _unseen,
     follow_limbs,
 )
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
@@ -220,7 +221,11 @@ def test_a_limb_without_points_goes_evenly_from_where_it_was_seen_to_where_it_is
     tracking = PoseTracking(fit=bare, points=points, time_s=time_s, first=first, tracks=None)
     (arm,) = [limb for limb in whole_limbs(bare.parameters) if NAMES[limb.bones[0]] == "upper_arm.R"]
     astray = np.array([POSES[0], *[_raised(130.0)] * (FRAMES - 2), POSES[-1]])
-    assert _unseen(tracking, astray, arm) == [range(FRAMES)]
+    seen = _points_of_bones(tracking, astray)[:, arm.bones].sum(axis=1) >= bare.settings.min_points
+    assert seen.tolist() == [True, False, False, False, True] and _stretches(seen) == [range(FRAMES)]
+    assert _stretches(np.array([False, True, True, False, True, False])) == [
+        range(2, 5)
+    ]  # nothing is known before the first and after the last
     way = _even(tracking, astray, arm, range(FRAMES))
     assert [t for t, _, _ in way] == [1, 2, 3]
     even = astray.copy()

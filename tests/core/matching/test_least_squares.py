@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.fft import fft2, fftfreq, ifft2
 
+from tricap.core.foundation.arrays import concatenated
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import (
@@ -22,7 +23,6 @@ from tricap.core.matching.least_squares import (
     PatchTemplates,
     SearchImage,
     TemplatePoints,
-    join_matches,
     match_patches,
     match_prepared,
     prepare_templates,
@@ -255,7 +255,7 @@ def test_rows_never_shift_and_failures_keep_theirs() -> None:
     assert (m.status[::7] == MatchStatus.OUT_OF_IMAGE).all() and m.ok.sum() > 0.8 * len(xy)
     assert np.linalg.norm(m.xy - xy - [0.4, -0.3], axis=1)[m.ok].max() < 0.2
     none = find(a, b, xy[:0])
-    assert len(none.xy) == 0 and len(join_matches([none, m]).xy) == len(xy)
+    assert len(none.xy) == 0 and len(concatenated([none, m]).xy) == len(xy)
 
 
 def test_unlike_speckle_is_not_matched() -> None:
