@@ -56,11 +56,13 @@ def test_a_window_that_cannot_be_set_up_in_time_is_a_sentence(tmp_path: Path) ->
     assert code == 0 and "could not be set up in the" in said
 
 
+@pytest.mark.slow
 def test_slow_tests_without_room_run_under_one_python(tmp_path: Path) -> None:
     code, said = ci(tmp_path, slow="sleep 6", seconds=(31, 20, 11))
     assert code == 0 and said.count("dev.py test -m slow") == 1 and "the slow tests are left to the other Python" in said
 
 
+@pytest.mark.slow
 def test_tests_that_hang_are_stopped(tmp_path: Path) -> None:
     code, said = ci(tmp_path, slow="exec sleep 30", quick="exec sleep 30", seconds=(3, 1, 1))
     assert code == 1 and "stopped after 1 s" in said and "Window: exit code 0" in said

@@ -39,6 +39,7 @@ def fuzz(folder: Path, count: int, *names: str) -> tuple[list[dict], str]:
     return [json.loads(line) for line in done.stdout.splitlines()], began[-1] if done.returncode and began else ""
 
 
+@pytest.mark.slow
 def test_only_input_errors_come_out_of_damaged_files(tmp_path: Path) -> None:
     said, died = fuzz(tmp_path, COUNT)
     assert not died, f"the process died in “{died}”"

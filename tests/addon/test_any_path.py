@@ -45,6 +45,7 @@ def test_operators_with_paths_that_are_none(blender: ModuleType, small_run: Smal
     assert len(refused) > 15
 
 
+@pytest.mark.slow
 def test_fifty_steps_back_and_forth(blender: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """The results, the frame and the panel's settings go with the steps, and everything works afterwards."""
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

@@ -100,6 +100,7 @@ def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_pat
     assert len(empty.data.objects["Reference bar"].data.vertices) <= 2 * FRAMES
 
 
+@pytest.mark.slow
 def test_a_board_beside_the_wand(blender, empty, bar: Path, tmp_path: Path) -> None:
     board = Board(kind=BoardKind.CHESSBOARD, squares=(9, 6), square_m=0.05)
     filmed(tmp_path / "board", board, benchmark_cameras(), 5)

@@ -23,6 +23,7 @@ def small(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return run
 
 
+@pytest.mark.slow
 def test_beside_the_file_with_the_commands_surface(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
     folder = tmp_path / "mon élan"
     folder.mkdir()

@@ -99,6 +99,7 @@ def crossing_faces(bpy: ModuleType, thing: object) -> int:
     return sum(a < b and not set(corners[a]) & set(corners[b]) for a, b in tree.overlap(tree))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "bones"), [("arm.R", ["forearm.R"]), ("leg.L", ["shin.L"]), ("full", ["forearm.L", "shin.R"])])
 def test_elbows_and_knees_bend_without_the_skin_crossing_itself(empty: ModuleType, model: str, bones: list[str]) -> None:
     from tricap.addon.scene import armature, skin

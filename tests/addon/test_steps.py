@@ -201,6 +201,7 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
     assert "tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
 
 
+@pytest.mark.slow
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
     scene, out = done, tmp_path / "out"
@@ -411,6 +412,7 @@ def test_clicks_are_intersected_once(
         assert found.status == "failed" and "wrist.R" in found.message and asked.count("wrist.R") == 3
 
 
+@pytest.mark.slow
 def test_swapped_views_are_told(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
     scene = opened(blender, sample, tmp_path)
     views = scene.tricap.views

@@ -30,6 +30,7 @@ HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"
 DATA = HERE / "data"
 STEP_S = 0.02
+ESC_S = 1.0
 Steps = Iterator[None]
 
 failures: list[str] = []
@@ -143,6 +144,17 @@ def key(name: str, **held: bool) -> Steps:
         window().event_simulate(type=name, value=value, x=_mouse[0], y=_mouse[1], **held)
         yield
     yield
+
+
+def stopped_by_esc(what: str) -> Steps:
+    """Esc ends the running job within a second more than this window needs for a key that does nothing: it is drawn between two events."""
+    began = time.monotonic()
+    yield from key("F19")
+    pressed = time.monotonic()
+    yield from key("ESC")
+    yield from wait_for(lambda: not bpy.context.window_manager.tricap.running, 30, what)
+    any_key, esc = pressed - began, time.monotonic() - pressed
+    check(esc - any_key < ESC_S * slowness(), f"Esc took {esc:.2f} s, a key that does nothing {any_key:.2f} s")
 
 
 def enter_text(x: float, y: float, text: str) -> Steps:

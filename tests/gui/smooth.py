@@ -17,7 +17,6 @@ GAP_S = 0.1  # a person does not notice
 BUSY = 2.0  # jobs for each core: from there on the window waits longer for its turn than for Python
 RARELY = 0.01  # of the gaps may be longer
 LONGEST_S = 0.5  # on a machine that does nothing else
-ESC_S = 1.0
 
 
 def steps() -> drive.Steps:
@@ -37,11 +36,7 @@ def steps() -> drive.Steps:
             break
         seen.append(stage)
         drive.say(f"during {stage}:", busy)
-        pressed = time.monotonic()
-        yield from drive.key("ESC")
-        yield from drive.wait_for(lambda: not state.running, 30, f"Esc ends the job during {stage}")
-        took = time.monotonic() - pressed
-        drive.check(took < ESC_S * display.slowness(), f"Esc during {stage} took {took:.2f} s (load {display.slowness():.1f} of each core)")
+        yield from drive.stopped_by_esc(f"Esc ends the job during {stage}")
     judge(np.concatenate(gaps[: len(seen)]), idle.gaps_s())  # the making of the scene, which follows, is Blender's own thread's
     drive.check(len(seen) > 2, f"stopped by Esc in {', '.join(seen)}")
 

@@ -131,6 +131,7 @@ def test_a_finger_bends_by_60_degrees_at_its_joints() -> None:
         assert np.linalg.norm(moved[tip] - skin().vertices_m[tip], axis=1).min() > 0.004
 
 
+@pytest.mark.slow
 def test_relief_leaves_fingers_as_they_are() -> None:
     mesh, shape = skin(), person()
     normals = np.zeros(mesh.vertices_m.shape)

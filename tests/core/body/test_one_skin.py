@@ -223,6 +223,7 @@ def test_hinges_are_read_from_the_limits() -> None:
     assert not hinge(bones["hand.R"]).any() and not hinge(bones["pelvis"]).any()
 
 
+@pytest.mark.slow
 def test_the_head_of_somebody_with_a_short_neck_is_sewn_on_above_the_shoulders() -> None:
     """The shoulders reach above the place where the neck usually ends."""
     whole = default_shape(read_model("full"))

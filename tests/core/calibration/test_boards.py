@@ -116,6 +116,7 @@ def test_views_out_of_step_are_found_and_reported() -> None:
     assert error_m(held.cameras, done.rig.cameras) < 2.5 * bound_m(held, 0.1)
 
 
+@pytest.mark.slow
 def test_cameras_that_are_not_in_step_are_calibrated_with_a_waved_board() -> None:
     """Measured over 6 recordings: delays within 0.0003 images, errors 1.0 to 1.6 times the bound of cameras in step."""
     rng, delay = np.random.default_rng(2), (0.0, 0.37, -2.2)
@@ -207,6 +208,7 @@ def test_views_that_fit_to_a_hundredth_of_a_pixel_are_synchronised() -> None:
     assert not calibrate_rig(observed(replace(held, xy_px=xy)), Monitor()).calibration.remarks
 
 
+@pytest.mark.slow
 def test_cameras_exchanged_towards_the_end_are_never_good() -> None:
     held = drawn(3, sigma_px=0.1)
     xy = held.xy_px.copy()
@@ -364,6 +366,7 @@ def test_images_without_a_board_are_refused(tmp_path: Path, capsys: pytest.Captu
     assert "View L" in (shown := capsys.readouterr().err) and "never shows the chessboard of 9×6 inner corners" in shown
 
 
+@pytest.mark.slow
 def test_a_charuco_board_whose_sides_were_exchanged_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     filmed(tmp_path / "board", CHARUCO, tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2]), 4)
     described = ["--board", "charuco", "--squares", "4x5", "--square", "0.14", "--dictionary", "DICT_5X5_100"]

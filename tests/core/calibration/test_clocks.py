@@ -84,6 +84,7 @@ def test_fisheye_cameras_at_three_rates() -> None:
     assert all(c.fisheye for c in done.rig.cameras) and error_m(cameras, done.rig.cameras) < 3e-4
 
 
+@pytest.mark.slow
 def test_a_waved_board_at_two_rates() -> None:
     cameras = benchmark_cameras()[:2]
     found = []
@@ -112,6 +113,7 @@ def test_a_board_that_looks_the_same_from_both_ends_keeps_its_order() -> None:
         np.testing.assert_allclose(second[n], (corners + n)[::-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_rate_of_each_view(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """L takes every second image of the others."""
     cameras = benchmark_cameras()

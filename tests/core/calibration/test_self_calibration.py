@@ -63,6 +63,7 @@ def test_random_rigs_converge(noise: BarNoise) -> None:
     assert max(ratios) < WORST_RATIO, ratios
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seen_by", ["neighbours", "any two"])
 def test_cameras_need_no_position_in_common(seen_by: str) -> None:
     """Four cameras; every position of the bar is seen by two of them only."""
@@ -206,6 +207,7 @@ def test_coefficients_of_a_fisheye_lens_that_are_small_by_chance_are_not_certain
     assert certain[5, 5] == 0 and fisheye[5, 5] == pytest.approx(2 / 3, rel=1e-3)  # E τ of three unknowns that are 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [Lens.FISHEYE, Lens.AUTO])
 def test_fisheye_lenses_are_calibrated_with_a_bar(lens: Lens) -> None:
     """Measured over 5 rigs: 0.04 to 0.08 mm, with the ends in any order."""
@@ -254,6 +256,7 @@ def waved_out_of_step(seed: int, delay_images: tuple[float, ...], positions: int
     return waved_bar(benchmark_cameras(), positions, np.random.default_rng(seed), noise, delay_images=delay_images, pace=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_images", [(0.0, 0.31, -0.46), (0.0, 4.2, -2.7)], ids=["parts of an image", "images"])
 def test_cameras_that_are_not_in_step_are_calibrated_as_well(delay_images: tuple[float, ...]) -> None:
     apart = waved_out_of_step(3, delay_images)

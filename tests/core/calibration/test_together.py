@@ -171,6 +171,7 @@ def test_other_cameras_are_refused() -> None:
         calibrated(waved, boards.changed(np.where(np.arange(20)[:, None, None, None] < 3, boards.xy_px, np.nan)), lenses_only=True)
 
 
+@pytest.mark.slow
 def test_the_command_calibrates_with_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = benchmark_cameras()[:2]
     waved = waved_bar(cameras, 24, np.random.default_rng(2), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))

@@ -158,12 +158,14 @@ RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "fi
            rays: "rays miss", damaged: "input"}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_finished_run_passes(finished: Path) -> None:
     checked = check_run(finished / "out", Monitor())
     assert [f for f in checked.findings if f.cause != "large sigma"] == [], checked.lines()  # the twist of 384 px may be unsure
     assert checked.figures["points_per_frame"] > 100 and "elbow.R flexion" in checked.figures["angle_sigma_deg"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", RESULTS, ids=lambda fault: fault.__name__)
 def test_a_fault_of_a_result_is_named(fault: Callable[[Path], None], finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")

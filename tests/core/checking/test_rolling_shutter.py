@@ -51,6 +51,7 @@ def rolling_take(folder: Path, readout: dict[str, float], late: dict[str, float]
     return folder
 
 
+@pytest.mark.slow
 def test_the_readout_is_found_with_its_sigma_beside_an_offset(tmp_path: Path) -> None:
     """Measured: 0.012 frames at worst; (2) bends too little where the motion turns within few frames."""
     take = rolling_take(tmp_path, {"L": -0.3, "R": 0.5}, {"R": -0.4})

@@ -54,6 +54,7 @@ def test_recent_pictures_are_not_decoded_again() -> None:
     assert Counted.asked == 9 and (recent.count, recent.source, recent.files()) == (9, "x", ())
 
 
+@pytest.mark.slow
 def test_a_view_late_by_frames_is_told_to_be_shifted_first(tmp_path: Path) -> None:
     make_arm_take(tmp_path / "take", ArmTakeSettings(width_px=320, frames=8, interlaced="none", late_frames=1.3))
     with pytest.raises(InputError, match=r"View R has a time offset of .1.[23]\d frames, too large to correct; add -1"):

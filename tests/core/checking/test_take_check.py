@@ -319,6 +319,7 @@ MEASURED = {black: "View L is black", identical: "show the same image", swapped:
             seed_on_the_wall: "Surface seed 1"}  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MEASURED, ids=lambda make: make.__name__)
 def test_measuring_it_all_the_same_names_the_cause(make: Callable[[Path], None], arm_recording: Record, tmp_path: Path) -> None:
     """An error where nothing can be measured, a warning in run.json where something can."""

@@ -61,6 +61,7 @@ def _run(out: Path) -> dict[str, Any]:
     return json.loads((out / "run.json").read_text())  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 def test_keypoints_stand_for_a_surface_that_cannot_be_measured(tmp_path: Path) -> None:
     take, out = _with_keypoints(tmp_path / "take"), tmp_path / "out"
     job = pipeline.run(take, out)

@@ -54,6 +54,7 @@ def _tracks(vertices, visible, rng):
     return SimpleNamespace(frames=np.arange(T), xyz_m=xyz, sigma_m=np.where(np.isfinite(xyz[..., 0]), 8e-4, np.nan))
 
 
+@pytest.mark.slow
 def test_arm_of_a_whole_person() -> None:
     truth, take, rig = np.load(TAKE / "truth.npz"), tomllib.loads((TAKE / "take.toml").read_text()), read_rig(TAKE / "rig.toml")
     V, triangles = truth["vertices_m"].astype(float), truth["triangles"]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
@@ -41,6 +42,7 @@ def test_bones_are_more_alike_than_flesh_and_the_more_so_the_more_frames_share_a
         assert np.allclose(sigma[bones], 0.015 / np.sqrt(frames)) and np.allclose(sigma[~bones], 0.03)
 
 
+@pytest.mark.slow
 def test_clicks_make_one_shin_longer_only_where_people_may_be_uneven() -> None:
     longer = []
     for settings in (FitSettings(symmetry_sigma=1.0), FitSettings()):

@@ -62,6 +62,7 @@ def test_values_are_short() -> None:
     assert [written(v) for v in (np.nan, 0.0, 12_345.6, 98.163, 0.25, 100.0)] == ["–", "0", "12,346", "98.2", "0.250", "100"]
 
 
+@pytest.mark.slow
 def test_both_methods_on_a_take(plane_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
     """Two runs in folders of their own, one page and one table; a second call computes nothing."""
     take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"

@@ -163,6 +163,7 @@ def test_a_second_run_in_the_same_folder(take: Path, tmp_path: Path, whole: dict
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of Unix")
 def test_a_run_that_is_halted_keeps_its_folder_and_goes_on(take: Path, tmp_path: Path, whole: dict[str, bytes], capfd: Capture) -> None:
     """SIGSTOP, as by Ctrl-Z or a laptop's lid: no other run takes the folder over, and after SIGCONT the result is the same."""

@@ -48,6 +48,7 @@ def test_the_preset_is_a_key_of_the_take_and_an_option(plane_take: Path, tmp_pat
         assert run.record["settings"]["method"] == {"preset": PUBLISHED} and "--set method.preset=published" in run.record["repeat"]
 
 
+@pytest.mark.slow
 def test_without_automatic_seeds_the_surface_starts_from_clicks(plane_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
     """Clicked points of the surface, or else the surface before the clicked joints; the next frame's seeds are points of this one."""
     take = tmp_path / "take"

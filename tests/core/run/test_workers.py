@@ -42,6 +42,7 @@ def test_workers_give_the_bytes_of_one_process(plane_take: Path, tmp_path: Path,
     assert len(many) == 8 and many == checkpoints(tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes_and_leaves_no_process(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[str]] = []
     popen = subprocess.Popen

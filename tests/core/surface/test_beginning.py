@@ -57,6 +57,7 @@ def test_a_take_whose_first_frames_show_nobody_begins_in_another(plane_take: Pat
     assert again == points and same["warnings"] == record["warnings"]
 
 
+@pytest.mark.slow
 def test_a_take_that_shows_nobody_fails(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
     take = emptied(plane_take, tmp_path / "take", scenes, range(4))
     with pytest.raises(NothingMeasured, match="frame 0"):
@@ -69,6 +70,7 @@ def begun(take: Path, out: Path, settings: Any) -> Beginning | None:
         return other_beginning(open_take(read_take(take)), MeasureSettings.of(s), results, Monitor())
 
 
+@pytest.mark.slow
 def test_pairs_of_views_are_accepted_where_three_give_too_little(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
     """R shows nothing: with three views no frame has points, with two of them all have. Without that defect pairs are not needed."""
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))

@@ -89,6 +89,7 @@ def test_a_reduced_camera_sees_the_same_corners(large_take: Path) -> None:
     assert np.allclose(small.project(X) + 0.5, (camera.project(X) + 0.5) * scale)
 
 
+@pytest.mark.slow
 def test_a_reduced_image_gives_fewer_points_as_good_in_full_pixels(large_take: Path, limb: Any, few_points: None, tmp_path: Path) -> None:
     run, whole = _tracked(large_take, tmp_path / "motion"), _tracked(large_take, tmp_path / "surface", {"surface": {"quality": "surface"}})
     for t in range(3):

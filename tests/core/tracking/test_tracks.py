@@ -161,6 +161,7 @@ class Traveller:
         return np.full(len(xyz_m), self.in_sight)
 
 
+@pytest.mark.slow
 def test_a_guide_carries_lost_points_longer_than_neighbours(tmp_path: Path, scenes: Any) -> None:
     """Occluded for two frames with a wait of one: only a guide brings the points back, to their places, and not where it occludes them."""
     bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(5)]
