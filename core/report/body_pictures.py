@@ -5,30 +5,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..body.motion import BodyFit
-from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.extremities import shape_with_ends
 from ..geometry.rig import Rig
 from . import pictures
 from .close_up import alike, close_up
+from .person import SkinAt
 from .silhouettes import OUTLINE, PERSON, Silhouettes
 
 
 class BodyPictures:
     """The pictures of a body in the frames `chosen` (indices of its motion), as close-ups (`near`) or whole images; none without
-    a body."""
+    a body or its skin."""
 
     def __init__(
-        self, body: BodyFit | None, silhouettes: Silhouettes, settings: SkinSettings, rig: Rig, chosen: Sequence[int], *, near: bool = True
+        self, body: BodyFit | None, silhouettes: Silhouettes, skin_at: SkinAt | None, rig: Rig, chosen: Sequence[int], *, near: bool = True
     ) -> None:
-        self._body, self._silhouettes, self._settings = body, silhouettes, settings
-        self._skins = {i: body_skin(shape_with_ends(body.shape, settings), body.motion.values[i], settings) for i in chosen} if body else {}
+        self._body, self._silhouettes = body, silhouettes
+        self._skins = {i: skin_at(body.motion.values[i]) for i in chosen} if body and skin_at else {}
         places = [skin.vertices_m for skin in self._skins.values()] if near else []
         self._views = alike([close_up(camera, places) for camera in rig.cameras])
 
     def of_frame(self, index: int, images: Sequence[np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """File name → (caption, picture) of each view; `images` (h, w) are those of the frame."""
         body, found = self._body, dict[str, tuple[str, np.ndarray]]()
-        if body is None:
+        if body is None or index not in self._skins:
             return found
         frame, skin = int(body.motion.frames[index]), self._skins[index]
         for image, view in zip(images, self._views):

@@ -4,7 +4,7 @@ The page begins with what came out and what is doubtful; then come the figures o
 """
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -33,7 +33,7 @@ from .graphs import curve_graph
 from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
 from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
-from .person import Mesh, skin_in
+from .person import SkinAt, skin_in
 from .silhouettes import Silhouettes
 from .trails import trail_pictures, vector_pictures
 
@@ -92,7 +92,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     record, fits = report.record, report.silhouettes.fits
     trails = trail_pictures(results.path("trajectories_raw.npz"), report.footage.rig.cameras[report.footage.take.reference])
     skin_at = skin_in(results.path("skin"), report.body, SkinSettings(**record["settings"]["skin"]))
-    shown = _pictures(report, monitor, pictured, skinned=skin_at is not None) | {
+    shown = _pictures(report, skin_at, monitor, pictured) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
     if report.trajectories is not None:
@@ -118,7 +118,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     store.write_text(results.path("report", "report.html"), page)
 
 
-def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skinned: bool) -> dict[str, tuple[str, np.ndarray]]:
+def _pictures(report: Report, skin_at: SkinAt | None, monitor: Monitor, pictured: Sequence[int]) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
     footage, clouds, trajectories = report.footage, report.clouds, report.trajectories
     ref = footage.take.reference
@@ -127,8 +127,7 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skin
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
     near = close_up(camera, [clouds[i].xyz_m for i in chosen] if report.close_ups else [])
-    settings = SkinSettings(**report.record["settings"]["skin"])
-    bodies = BodyPictures(report.body if skinned else None, report.silhouettes, settings, footage.rig, chosen, near=report.close_ups)
+    bodies = BodyPictures(report.body, report.silhouettes, skin_at, footage.rig, chosen, near=report.close_ups)
     for n, i in enumerate(chosen):
         monitor.step("report", n, 2 * len(chosen))
         cloud = clouds[i]
@@ -155,7 +154,7 @@ def _first_middle_last(report: Report) -> list[int]:
     return sorted({0, min(sorted(compared), key=lambda i: abs(i - count // 2)), count - 1})
 
 
-def _layers(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None) -> dict[str, tuple[str, np.ndarray]]:
+def _layers(report: Report, skin_at: SkinAt | None) -> dict[str, tuple[str, np.ndarray]]:
     """The picture of the body's layers; none without a skin."""
     if report.body is None or skin_at is None:
         return {}
@@ -166,7 +165,7 @@ def _layers(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None) -> dic
     return {"layers.png": (caption, layers_picture(shape, body_skin(shape_with_ends(shape, settings), rest, settings), skin_at(rest)))}
 
 
-def _shots(report: Report, skin_at: Callable[[np.ndarray], Mesh] | None, monitor: Monitor) -> list[Shot]:
+def _shots(report: Report, skin_at: SkinAt | None, monitor: Monitor) -> list[Shot]:
     """The body over the footage of the reference view, in frames all over the recording and in doubtful ones."""
     body, footage = report.body, report.footage
     if body is None or skin_at is None:

@@ -25,7 +25,10 @@ class Mesh:
     weights: np.ndarray  # (V, B)
 
 
-def skin_in(folder: Path, body: BodyFit | None, settings: SkinSettings) -> Callable[[np.ndarray], Mesh] | None:
+SkinAt = Callable[[np.ndarray], Mesh]  # of a pose (D,)
+
+
+def skin_in(folder: Path, body: BodyFit | None, settings: SkinSettings) -> SkinAt | None:
     """The skin as a function of the pose (D,): that in `folder`, or without one that of the metaballs; None for a body without a skin."""
     if body is None:
         return None
@@ -40,7 +43,7 @@ def skin_in(folder: Path, body: BodyFit | None, settings: SkinSettings) -> Calla
     return lambda pose: Mesh(vertices_m=poser.posed(vertices, pose), triangles=triangles, weights=weights)
 
 
-def _of_metaballs(body: BodyFit, settings: SkinSettings) -> Callable[[np.ndarray], Mesh] | None:
+def _of_metaballs(body: BodyFit, settings: SkinSettings) -> SkinAt | None:
     try:
         at = skins_in(shape_with_ends(body.shape, settings), body.motion.values, settings)
     except InputError:

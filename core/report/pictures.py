@@ -5,13 +5,13 @@ import numpy as np
 
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..body.skin.contour_skin import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..geometry.robust import finite_median
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
 from .drawing import OF_PANELS, add_axes, add_colour_bar, add_scale, value_colours
+from .person import Mesh
 from .silhouettes import outlines_of
 
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
@@ -27,7 +27,7 @@ SLOW_M_S = 0.2  # the speed of red points is at least this
 
 
 def body_over_footage(
-    grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, skin: Skin, person_px: np.ndarray | None = None
+    grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, skin: Mesh, person_px: np.ndarray | None = None
 ) -> np.ndarray:
     """The `skin` of one pose, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the pose's DOFs.
 

@@ -18,21 +18,18 @@ import cv2
 import numpy as np
 
 from ..body.motion import BodyFit
-from ..body.shape import BodyShape
 from ..body.skeleton import Skeleton
-from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.extremities import shape_with_ends
 from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import filled
-from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.threads import in_threads
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
 from ..take.footage import Footage
+from .person import Mesh, SkinAt
 
 OUTLINE, BACKGROUND = "outline", "background"
-MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second
+MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take
 TOGETHER = 4  # frames whose silhouettes are in memory at once
 PERSON = {OUTLINE: "the person's outline", BACKGROUND: "the person in front of the background"}  # by source
 WHOLE_BODY = frozenset({"head", "forearm.L", "forearm.R", "shin.L", "shin.R"})  # bones; a model without one of them is a part of a body
@@ -70,12 +67,14 @@ class Silhouettes:
 def silhouettes_of(
     footage: Footage,
     body: BodyFit,
-    settings: SkinSettings,
+    skin_at: SkinAt | None,
     outlines: Mapping[str, Mapping[int, np.ndarray]],
     backgrounds: Sequence[BackgroundDistances],
     monitor: Monitor,
 ) -> Silhouettes:
-    """The agreement of the body with the outlines, and in views without one with the regions that cover the still background.
+    """The agreement of the body's skin with the outlines, and in views without one with the regions that cover the still background.
+
+    Nothing is compared for a body without a skin.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -83,12 +82,12 @@ def silhouettes_of(
     frames, whole = body.motion.frames, is_whole_body(body.shape.skeleton)
     most = MOST_FRAMES[OUTLINE if outlines else BACKGROUND]
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-    if not outlines and not backgrounds:
+    if skin_at is None or (not outlines and not backgrounds):
         return Silhouettes(whole=whole)
     found, regions = list[SilhouetteFit](), {r.view: r for r in backgrounds}
 
     def masks_at(i: int) -> list[np.ndarray]:
-        return [] if monitor.cancelled else body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)
+        return [] if monitor.cancelled else body_masks(footage.rig.cameras, skin_at(body.motion.values[i]))
 
     together = [chosen[n : n + TOGETHER] for n in range(0, len(chosen), TOGETHER)]
     masked = ((int(i), masks) for some in together for i, masks in zip(some, in_threads(masks_at, some.tolist())))
@@ -133,12 +132,8 @@ def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
     return table
 
 
-def body_masks(cameras: Sequence[Camera], shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> list[np.ndarray]:
-    """The silhouette of a body in each camera (h, w), holes filled; empty for a body without a skin."""
-    try:
-        skin = body_skin(shape_with_ends(shape, settings), values, settings)
-    except InputError:
-        return [np.zeros(camera.size_px[::-1], bool) for camera in cameras]
+def body_masks(cameras: Sequence[Camera], skin: Mesh) -> list[np.ndarray]:
+    """The silhouette of a skin in each camera (h, w), holes filled."""
     masks = []
     for camera in cameras:
         raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)

@@ -39,6 +39,7 @@ from ..matching.foreground import Foreground
 from ..motion.formats.ply import write_mesh
 from ..motion.tables import write_joints, write_motion
 from ..report.pages import Report, write_report
+from ..report.person import skin_in
 from ..report.silhouettes import by_view, silhouettes_of
 from ..results.folder import FitCheckpoints
 from ..surface.beginning import other_beginning
@@ -294,7 +295,8 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     run.body = body = _write_body(run, body, monitor)
     run.results.remove("cache/fit", "cache/fit_again")
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
-    run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
+    skin_at = skin_in(run.results.path("skin"), body, run.settings["skin"])
+    run.silhouettes = silhouettes_of(run.footage, body, skin_at, outlines, background, monitor)
     return given, body, tracked_again
 
 

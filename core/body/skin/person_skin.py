@@ -25,7 +25,7 @@ from .fingers import FINGER_BONE, RIGID_BONE
 from .head_place import HeadPlace
 from .mesh import DETAIL, SkinSettings, chain_faces, chains_uv
 from .rays import smooth
-from .relief import SurfacePoints, directions, measured_relief
+from .relief import SurfacePoints, measured_relief
 from .welding import cut
 
 REST = "rest.npz"  # in the folder skin/
@@ -85,7 +85,8 @@ def with_relief(
         Cancelled: the monitor was cancelled.
     """
     straight, skin = skin, skin if place is None else place.moved(skin)
-    relief, along = measured_relief(skin, shape, frames, mirror, monitor, straight), directions(skin, shape)
+    relief = measured_relief(skin, shape, frames, mirror, monitor, straight)
+    along = relief.along
     displacement = without_folds(skin.vertices_m, skin.faces, relief.displacement_m, along)
     rough, every = skin.vertices_m + displacement[:, None] * along, np.ones(len(along), dtype=bool)
     fair = faired_outside_folds(rough, skin.faces, faired(rough, skin.faces, _kept(skin, shape), OF_RELIEF))

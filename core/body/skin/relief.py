@@ -78,14 +78,16 @@ class SurfacePoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Relief:
-    """Displacements of V vertices along their normals [m], outwards positive, and the standard deviations of where the skin is."""
+    """Displacements of V vertices along `directions` [m], outwards positive, and the standard deviations of where the skin is."""
 
     displacement_m: np.ndarray  # (V,)
     sigma_m: np.ndarray  # (V,) the prior's, where nothing was measured
+    along: np.ndarray  # (V, 3) the directions
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "displacement_m", frozen(self.displacement_m, (None,), name="displacement_m"))
         object.__setattr__(self, "sigma_m", frozen(self.sigma_m, self.displacement_m.shape, name="sigma_m"))
+        object.__setattr__(self, "along", frozen(self.along, (len(self.displacement_m), 3), name="along"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -106,11 +108,11 @@ def measured_relief(
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    poser, normals = Poser(shape, skin.weights), directions(skin, shape)
+    poser, nearby = Poser(shape, skin.weights), Nearby(skin.vertices_m, skin.faces)
+    normals = directions(skin, shape, nearby)
     size, fingers = _prior_sigma(shape, skin), _fingers(shape, skin)
     gate = np.where(fingers < 0.5, GATE * np.maximum(size, PRIOR_M * _share(shape, skin, (HEAD,))), 0.0)
-    prior, nearby = _prior(skin.vertices_m, skin.faces, size), Nearby(skin.vertices_m, skin.faces)
-    delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
+    prior, delta, factor, weight = _prior(skin.vertices_m, skin.faces, size), np.zeros(len(normals)), None, np.zeros(0)
     smoothed = anatomical(shape, skin.weights)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
         moved, found = skin.vertices_m + delta[:, None] * normals, list[_Observed]()
@@ -123,13 +125,13 @@ def measured_relief(
         delta, factor, weight = _adjusted(prior, nearby, seen, reweightings)
     sigma = _sigmas(factor, prior, seen, weight)
     symmetric, may = straight or skin, mirror | (_share(shape, skin, (HEAD,)) > HEADS)
-    before, count = (symmetric.vertices_m, directions(symmetric, shape)), len(seen.d)
+    before, count = (symmetric.vertices_m, normals if symmetric is skin else directions(symmetric, shape)), len(seen.d)
     seen, weight = _mirrored(*before, may, delta, sigma, size, seen, weight)
     if len(seen.d) > count:
         total, right = (np.bincount(seen.vertex, w, len(delta)) for w in (weight, weight * seen.d))
         factor = factorised(prior.T @ prior, total)
         delta, sigma = factor.solve(right), _sigmas(factor, prior, seen, weight)
-    return Relief(displacement_m=(1 - fingers) * delta, sigma_m=np.hypot((1 - fingers) * sigma, fingers * size))
+    return Relief(displacement_m=(1 - fingers) * delta, sigma_m=np.hypot((1 - fingers) * sigma, fingers * size), along=normals)
 
 
 class Nearby:
@@ -153,10 +155,10 @@ class Nearby:
         return np.asarray(np.maximum(np.sqrt(np.pi / 2) * mean, LEAST_SIGMA_M))
 
 
-def directions(skin: OneSkin, shape: BodyShape) -> np.ndarray:
+def directions(skin: OneSkin, shape: BodyShape, nearby: Nearby | None = None) -> np.ndarray:
     """(V, 3) along which a skin is displaced: its normals, at head, hands and feet those of the surface without nose, ears and toes."""
     normals = vertex_normals(skin.vertices_m, skin.faces)
-    smooth = Nearby(skin.vertices_m, skin.faces).mean(normals)
+    smooth = (nearby or Nearby(skin.vertices_m, skin.faces)).mean(normals)
     return _mixed(normals, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), anatomical(shape, skin.weights))
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from ...foundation import store
 from ...foundation.arrays import frozen
-from ...foundation.threads import in_threads
+from ...foundation.threads import equal_pieces, in_threads
 from ...geometry.camera import Camera
 from ..shape import BodyShape
 from .closed_skin import OneSkin
@@ -39,6 +39,7 @@ KEPT = 24  # colours of a texel, …
 LEAST_KEPT, LARGE_PX = 8, 2048  # … fewer in a texture that is wider than this, whose table would be too large
 ROBUST_GREY = 40.0  # distance from the average at which a colour's weight is halved
 REWEIGHTINGS = 4
+TOGETHER = 10_000  # texels, which a processor's cache holds
 SIGMA_M = 0.004  # σ_0 of (1)
 LEAST_TRUST = 0.2  # 1/(1 + (σ/σ_0)²): where less is known of the skin's place, σ > 8 mm, its colour may be the background's
 NEARER_M = 0.025  # by which another surface must be nearer to hide a texel
@@ -87,8 +88,10 @@ class TextureBaker:
         self._texels = Texels(skin=skin, corners=corners, shares=shares, ahead=ahead)
         n = len(self.texel)
         self._kept = int(np.clip(KEPT * (LARGE_PX / size_px) ** 2, LEAST_KEPT, KEPT))
-        self._weight = np.zeros((n, self._kept), dtype=np.float32)
+        self._weight = np.zeros((n, self._kept), dtype=np.float32)  # in any order, 0 where nothing is kept yet
         self._colour = np.zeros((n, self._kept), dtype=np.uint32)  # see `_packed`
+        self._count = np.zeros(n, dtype=np.int64)
+        self._least = np.zeros(n, dtype=np.float32)  # weight that a further colour must exceed
         sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
         self._trust = 1 / (1 + (self._texels.at(sigma) / SIGMA_M) ** 2)
         self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
@@ -98,27 +101,20 @@ class TextureBaker:
         """The images of all views in one frame, in which the body has the pose `motion` (D,)."""
         posed = self._poser.posed(self._skin.vertices_m, motion)
         normals = vertex_normals(posed, self._skin.faces)
-        places, across = self._texels.at(posed), self._texels.at(normals)
+        nearest = [nearest_depth(view.camera, posed[self._rows], self._cage) for view in views]
 
-        def shown(v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-            view = views[v]
-            depth = nearest_depth(view.camera, posed[self._rows], self._cage)
-            rows, size = _facing(view.camera, places, across)
-            weight = (size * self._trust[rows]).astype(np.float32)
-            better = weight > self._weight[rows, -1]  # the others need not be looked for
-            rows, weight = rows[better], weight[better]
-            free, xy = _unhidden(view.camera, places[rows], depth)
-            rgb, weight, rows = _sampled(view, xy), weight[free], rows[free]
-            facing, _ = _facing(view.camera, posed[self._rows], normals[self._rows])
-            free, xy = _unhidden(view.camera, posed[self._rows[facing]], depth)
-            grey = np.full(len(self._rows), np.nan)
-            grey[facing[free]] = _sampled(view, xy).mean(axis=1)
-            return rows, rgb, weight, grey
+        def shown(piece: slice) -> None:
+            places, across = self._texels.at(posed, piece), self._texels.at(normals, piece)
+            for v, view in enumerate(views):
+                rows, size = _facing(view.camera, places, across)
+                weight = (size * self._trust[piece][rows]).astype(np.float32)
+                better = weight > self._least[piece][rows]
+                rows, weight = rows[better], weight[better]
+                free, xy = _unhidden(view.camera, places[rows], nearest[v])
+                self._keep(piece.start + rows[free], _sampled(view, xy), weight[free], v)
 
-        on_cage = []
-        for v, (rows, rgb, weight, grey) in enumerate(in_threads(shown, range(len(views)))):
-            self._keep(rows, rgb, weight, v)
-            on_cage.append(grey)
+        in_threads(shown, equal_pieces(len(self.texel), TOGETHER, TOGETHER))
+        on_cage = [self._grey(view, depth, posed[self._rows], normals[self._rows]) for view, depth in zip(views, nearest)]
         for (a, b), found in self._ratios.items():
             both = (on_cage[a] > DARKEST) & (on_cage[b] > DARKEST)
             found.append(np.log(on_cage[a][both] / on_cage[b][both]))
@@ -126,7 +122,7 @@ class TextureBaker:
     def finished(self) -> Texture:
         """The texture of what was added."""
         gain = self._exposures()
-        seen = self._weight[:, 0] > 0
+        seen = self._count > 0
         placed = seen & (self._trust > LEAST_TRUST)
         seen = placed if placed.any() else seen
         colour = np.zeros((len(self.texel), 3))
@@ -140,20 +136,21 @@ class TextureBaker:
         return Texture(rgb=_padded(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), covered), seen=mask, covered=covered, exposures=gain)
 
     def _keep(self, rows: np.ndarray, rgb: np.ndarray, weight: np.ndarray, view: int) -> None:
-        """Put colours in place of the ones with the smallest weights; slots are sorted, largest weight first."""
-        better = weight > self._weight[rows, -1]
-        rows, rgb, weight = rows[better], rgb[better], weight[better]
-        own = self._weight[rows]
-        place = (own[:, :-1] >= weight[:, None]).sum(axis=1)  # of the new colours; those after it move on
-        slots, every = np.arange(self._kept), np.arange(len(rows))
-        order = slots - (slots > place[:, None])
-        for table, kept, new in (
-            (self._weight, own, weight),
-            (self._colour, self._colour[rows], _packed(np.rint(rgb).astype(np.uint8), view)),
-        ):
-            kept = np.take_along_axis(kept, order, axis=1)
-            kept[every, place] = new
-            table[rows] = kept
+        """Add colours where fewer than `KEPT` are kept, and put them in place of the ones with the smallest weights elsewhere."""
+        slot = self._count[rows]
+        full = slot == self._kept
+        slot[full] = self._weight[rows[full]].argmin(axis=1)
+        self._weight[rows, slot], self._colour[rows, slot] = weight, _packed(np.rint(rgb).astype(np.uint8), view)
+        self._count[rows[~full]] += 1
+        full = rows[self._count[rows] == self._kept]
+        self._least[full] = self._weight[full].min(axis=1)
+
+    def _grey(self, view: View, depth: np.ndarray, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """The grey value (M,) of vertices (M, 3) of the cage, NaN where a view does not show them."""
+        grey, (rows, _) = np.full(len(places), np.nan), _facing(view.camera, places, normals)
+        free, xy = _unhidden(view.camera, places[rows], depth)
+        grey[rows[free]] = _sampled(view, xy).mean(axis=1)
+        return grey
 
     def _exposures(self) -> np.ndarray:
         """(K,) g of (2)."""
@@ -178,14 +175,24 @@ class TextureBaker:
 
     def _averaged(self, rows: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Colours (N, 3) of texels that were seen."""
-        rgb, view = _unpacked(self._colour[rows])
-        rgb = rgb / gain[view][:, :, None]
-        weight = self._weight[rows] / self._weight[rows, :1]
-        robust = weight
-        for _ in range(REWEIGHTINGS):
-            mean = np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True)
-            robust = weight / (1 + (np.linalg.norm(rgb - mean[:, None], axis=2) / ROBUST_GREY) ** 2)
-        return np.asarray(np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True))
+        gains = gain.astype(np.float32)
+
+        def average(piece: slice) -> np.ndarray:
+            colour, view = _unpacked(self._colour[rows[piece]])
+            rgb, own = colour / gains[view][:, :, None], self._weight[rows[piece]]
+            weight = own / own.max(axis=1, keepdims=True)
+            robust = weight
+            for _ in range(REWEIGHTINGS):
+                away = rgb - _mean(rgb, robust)[:, None]
+                robust = weight / (1 + np.einsum("nkc,nkc->nk", away, away) / np.float32(ROBUST_GREY**2))
+            return _mean(rgb, robust)
+
+        return np.concatenate(in_threads(average, equal_pieces(len(rows), TOGETHER, TOGETHER)))
+
+
+def _mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Means (N, C) of values (N, K, C) with weights (N, K)."""
+    return np.asarray((weight[:, None] @ values)[:, 0] / weight.sum(axis=1, keepdims=True))
 
 
 def _packed(rgb: np.ndarray, view: int) -> np.ndarray:
@@ -201,7 +208,10 @@ def _unpacked(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Depths (h, w) [m] of the nearest quads (F, 4) of a mesh, infinite where there is none: of each its mean, the farthest drawn first."""
+    """Depths (h, w) [m] of the nearest quads (F, 4) of a mesh, infinite where there is none: of each its mean, the farthest drawn first.
+
+    Each quad is larger by `EDGE_PX`.
+    """
     width, height = camera.size_px
     z = camera.to_camera(vertices_m)[:, 2]
     with np.errstate(invalid="ignore"):
@@ -217,7 +227,7 @@ def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> 
     places = np.ascontiguousarray(np.rint(16 * corner[drawn[order]]), dtype=np.int32)
     for place, depth in zip(places, far[order].tolist()):
         cv2.fillConvexPoly(image, place, depth, shift=4)
-    return image
+    return cv2.erode(image, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8))
 
 
 def _facing(camera: Camera, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -231,13 +241,13 @@ def _facing(camera: Camera, places: np.ndarray, normals: np.ndarray) -> tuple[np
 
 
 def _unhidden(camera: Camera, places: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (M,) of places (N, 3) before a camera that lie inside its image with nothing in front of them, and their pixels (M, 2)."""
+    """The rows (M,) of places (N, 3) before a camera that lie inside its image with nothing of the nearest `depth` (h, w) in front of them,
+    and their pixels (M, 2)."""
     xy = camera.project(places)
     rows = np.flatnonzero(camera.sees(xy, EDGE_PX + 1))
     pixel = np.rint(xy[rows]).astype(np.int64)
-    near = cv2.erode(depth, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8))
     z = camera.to_camera(places[rows])[:, 2]
-    rows = rows[z < near[pixel[:, 1], pixel[:, 0]] + NEARER_M]
+    rows = rows[z < depth[pixel[:, 1], pixel[:, 0]] + NEARER_M]
     return rows, xy[rows]
 
 

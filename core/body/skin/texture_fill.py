@@ -42,9 +42,10 @@ class Texels:
     shares: np.ndarray  # (N, 3) and their weights
     ahead: np.ndarray  # (3,) where the body looks
 
-    def at(self, values: np.ndarray) -> np.ndarray:
-        """Values (V, …) of the vertices at the texels (N, …)."""
-        return np.asarray(sum(self.shares[:, i].reshape(-1, *[1] * (values.ndim - 1)) * values[self.corners[:, i]] for i in range(3)))
+    def at(self, values: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Values (V, …) of the vertices at the texels (N, …), or at some of them."""
+        corners, shares = self.corners[rows], self.shares[rows]
+        return np.asarray(sum(shares[:, i].reshape(-1, *[1] * (values.ndim - 1)) * values[corners[:, i]] for i in range(3)))
 
     @property
     def vertex(self) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.body.skin.extremities import shape_with_ends
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, Packed
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -31,12 +32,16 @@ def _body(shape: BodyShape, motion: np.ndarray) -> Any:
     return SimpleNamespace(shape=shape, motion=SimpleNamespace(frames=np.arange(3), values=motion))
 
 
+def _skin_at(shape: BodyShape) -> Any:
+    return lambda pose: body_skin(shape_with_ends(shape, SkinSettings()), pose)
+
+
 def _footage(scenes: Any) -> Any:
     return SimpleNamespace(rig=scenes.three_cameras(), frames=range(3))
 
 
 def _mask(scenes: Any, shape: BodyShape, motion: np.ndarray) -> np.ndarray:
-    return body_masks(scenes.three_cameras().cameras[1:2], shape, motion[0], SkinSettings())[0]
+    return body_masks(scenes.three_cameras().cameras[1:2], _skin_at(shape)(motion[0]))[0]
 
 
 def _outline(scenes: Any, shape: BodyShape, motion: np.ndarray, shift: float = 0.0) -> np.ndarray:
@@ -46,7 +51,7 @@ def _outline(scenes: Any, shape: BodyShape, motion: np.ndarray, shift: float = 0
 def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
     person = PERSON, PERSON_MOTION
     outlines = {"C": {0: _outline(scenes, *person), 2: _outline(scenes, *person, 6.0)}}
-    found = silhouettes_of(_footage(scenes), _body(*person), SkinSettings(), outlines, [], Monitor())
+    found = silhouettes_of(_footage(scenes), _body(*person), _skin_at(PERSON), outlines, [], Monitor())
     exact, shifted = found.fits
     assert (exact.view, exact.frame, exact.person) == ("C", 0, "outline") and exact.iou > 0.97 and exact.distance_px < 0.5
     mask = _mask(scenes, *person)
@@ -84,7 +89,7 @@ def test_an_arm_is_not_compared_with_the_whole_person(scenes: Any) -> None:
             2: np.array([[0, 0], [9, 0], [9, 9]], float),
         }
     }
-    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, [], Monitor())
+    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), _skin_at(ARM), outlines, [], Monitor())
     inside, beside = found.fits
     assert not found.whole and inside.inside == 1.0 and beside.inside < 0.02
     assert all(np.isnan([fit.iou, fit.distance_px]).all() for fit in found.fits)
@@ -116,7 +121,7 @@ def _regions(view: str, person: np.ndarray, step_px: int, *others: np.ndarray) -
 @pytest.mark.parametrize("step_px", [1, 4])
 def test_a_silhouette_before_the_background(scenes: Any, step_px: int) -> None:
     rig = scenes.three_cameras()
-    mask = body_masks(rig.cameras[:1], ARM, ARM_MOTION[0], SkinSettings())[0]
+    mask = body_masks(rig.cameras[:1], _skin_at(ARM)(ARM_MOTION[0]))[0]
     hollow = mask.copy()
     y, x = np.argwhere(mask).mean(axis=0).astype(int)
     hollow[y - 3 : y + 4, x - 3 : x + 4] = False  # what is surrounded by the person is the person
@@ -126,19 +131,20 @@ def test_a_silhouette_before_the_background(scenes: Any, step_px: int) -> None:
     assert found is not None and found.shape == mask.shape and found[y, x]
     assert (found & mask).sum() / (found | mask).sum() > {1: 0.98, 4: 0.85}[step_px]
     assert [person_mask(regions, frame, rig.cameras[0].size_px) for frame in (1, 2, 3)] == [None] * 3
-    fits = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), {}, [regions], Monitor()).fits
+    fits = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), _skin_at(ARM), {}, [regions], Monitor()).fits
     assert [(f.view, f.frame, f.person) for f in fits] == [("L", 0, "background")]
     assert fits[0].inside > {1: 0.98, 4: 0.9}[step_px]
     rows = figure_rows({}, [], None, None, fits)
     assert [r["name"] for r in rows] == ["silhouette of view L, share inside the person in front of the background"]
-    assert silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), {}, [], Monitor()).fits == ()
+    assert silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), _skin_at(ARM), {}, [], Monitor()).fits == ()
+    assert silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), None, {}, [regions], Monitor()).fits == ()
 
 
 def test_an_outline_goes_before_the_background(scenes: Any) -> None:
     mask = _mask(scenes, ARM, ARM_MOTION)
     outlines = {"C": {0: _outline(scenes, ARM, ARM_MOTION)}}
     regions = [_regions("C", ~mask, 4, np.where(mask[2::4, 2::4], 0, 9))]
-    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, regions, Monitor())
+    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), _skin_at(ARM), outlines, regions, Monitor())
     assert [(f.frame, f.person) for f in found.fits] == [(0, "outline"), (1, "background")] and found.fits[0].inside > 0.95
 
 
