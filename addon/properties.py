@@ -121,10 +121,8 @@ def exact(value: Any, default: Any = 0.0) -> Any:
     return float(str(np.float32(value))) if isinstance(default, float) else value
 
 
-def register() -> None:
-    """Make the classes of all stages and register them as `scene.tricap`."""
-    groups = {name: group_class(name, settings) for name, settings in stages().items()}
-    annotations: dict[str, Any] = {
+def _of_the_run() -> dict[str, Any]:
+    return {
         "take": bpy.props.StringProperty(
             name="Take",
             subtype="DIR_PATH",
@@ -140,6 +138,12 @@ def register() -> None:
             description="Folder for the results. Empty: next to the .blend file, or next to the take",
         ),
         "last": bpy.props.StringProperty(name="Result", description="Summary of the last run"),
+    }
+
+
+def _of_what_is_shown() -> dict[str, Any]:
+    """Switches whose state is that of the scene itself."""
+    return {
         "show_metaballs": bpy.props.BoolProperty(
             name="Metaballs",
             options=set(),
@@ -176,6 +180,12 @@ def register() -> None:
             set=lambda group, value: [foot_lock.activate(body, value) for body in standing.all_bodies(group.id_data)],
             description="Let the foot lock act; without it the feet move as measured",
         ),
+    }
+
+
+def _of_the_place() -> dict[str, Any]:
+    """Where the body stands and moves, and what stands behind it."""
+    return {
         "floor_m": bpy.props.FloatProperty(
             name="Floor",
             options=set(),
@@ -202,7 +212,12 @@ def register() -> None:
             description="What carries the path of the body over the floor",
         ),
     }
-    annotations |= take_properties.annotations()
+
+
+def register() -> None:
+    """Make the classes of all stages and register them as `scene.tricap`."""
+    groups = {name: group_class(name, settings) for name, settings in stages().items()}
+    annotations = _of_the_run() | _of_what_is_shown() | _of_the_place() | take_properties.annotations()
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
     body = {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."}
     scene_group = type("Tricap_scene", (bpy.types.PropertyGroup,), body)
