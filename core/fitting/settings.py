@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 17"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 18"  # part of the fit's key: raise it when the same input gives another body
 START_ALONE = ("full",)  # models whose joints need no clicks; a part of them starts alone where the whole person is visible
 
 

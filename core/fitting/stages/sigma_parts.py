@@ -22,7 +22,7 @@ from ...body.skeleton import Skeleton, bone_frames
 TURN = float(np.radians(20.0))
 CLOTH_M = 0.0007  # what a posture does not repeat
 FRAMES = 100  # evenly over the recording, that stand for all
-SEEN_M, GUESSED_M = 0.025, 0.1  # frame sigmas of a coordinate: up to where a joint is seen, and beyond which it is guessed
+SEEN_M, GUESSED_M = 0.025, 0.05  # frame sigmas of a coordinate: up to where a joint is seen, and beyond which it is guessed
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
