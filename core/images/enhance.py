@@ -61,6 +61,15 @@ def wallis(image: np.ndarray, settings: EnhanceSettings, *, row_step: int = 1) -
     return (d - m) * gain + b * np.float32(settings.mean) + (1 - b) * (m + centre)
 
 
+def without_shading(image: np.ndarray, window_px: int, *, row_step: int = 1) -> np.ndarray:
+    """The image (h, w) float32 less its mean in a window around each pixel: light and shade, which stay in place while a body turns.
+
+    `row_step` is 2 for a field of an interlaced frame. Cost: about 3 ns per pixel, for any window.
+    """
+    g = np.asarray(image, dtype=np.float32)
+    return g - cv2.blur(g, (window_px | 1, max(3, round(window_px / row_step)) | 1), borderType=cv2.BORDER_REFLECT_101)
+
+
 def texture_strength(image: np.ndarray, *, row_step: int = 1) -> float:
     """ρ of (2): the energy of the gradients as a multiple of what the noise gives them, in the textured half of the image."""
     g = np.asarray(image, dtype=np.float32)

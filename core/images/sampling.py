@@ -47,6 +47,11 @@ class SplineImage:
         self._ready_about = np.zeros((2 * self._ready.shape[0], 2 * self._ready.shape[1]), dtype=bool)  # half tiles, and those around them
         self._pixels: np.ndarray | None = None  # (3, h, w) grey values and gradients, on request
 
+    @property
+    def grey(self) -> np.ndarray:
+        """The image (h, w) float32."""
+        return self._grey
+
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the grey values' noise."""

@@ -7,6 +7,9 @@ the frame before it into the one after.
 At the outline of a limb, half of a patch shows the background. Such a point belongs to neither surface: it slides along the outline, with a
 high correlation. A point is therefore tracked only while its patch lies on the surface measured in the same frame, faces the camera, and
 has the depth of that surface. Its depth is then replaced by the surface's, which is corrected for curvature (surface/local_surface.py).
+
+Light and shade stay in place while a body turns, and with them patches of weak texture, which slide over the body with a high correlation.
+The images are therefore tracked without their mean over about a patch (`without_shading`). Within one frame, shading is texture like any other.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +19,8 @@ import numpy as np
 
 from ..foundation import store
 from ..foundation.progress import Monitor
-from ..images.enhance import EnhanceSettings
+from ..images.enhance import EnhanceSettings, without_shading
+from ..images.sampling import SplineImage
 from ..matching.least_squares import MatchingSettings
 from ..matching.region_growing import MatchedField
 from ..results.folder import Results
@@ -137,7 +141,8 @@ def _thinned(field: MatchedField, spacing_px: int) -> np.ndarray:
     return np.flatnonzero((i % n == 0) & (j % n == 0))
 
 
-ALGORITHM = "tracking 17"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 18"  # part of every key: raise it when the same input gives other numbers
+SHADING_PATCHES = 1.3  # side of the window whose mean is shading, in sides of a patch
 MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
 
 
@@ -214,8 +219,8 @@ def track_frames(
         done = _from_checkpoint(results, group, surface.frame, key)
         if done is None:
             if state.current is not None and images is None:
-                images = load_images(footage, state.current.frame, rules.enhance)
-            next_images = load_images(footage, surface.frame, rules.enhance)
+                images = _images(footage, state.current.frame, rules)
+            next_images = _images(footage, surface.frame, rules)
             start_new = bool(view.tracking.regenerate_every) and i % view.tracking.regenerate_every == 0
             tracked = _advance(view.at(surface.frame), state, _pair(images, next_images), surface, monitor, guide, start_new)
             done = tracked, _cut(view, tracked, next_images)
@@ -226,6 +231,16 @@ def track_frames(
         images = images if after is state else next_images
         state = after
         yield done[0]
+
+
+def _images(footage: Footage, frame: int, rules: TrackingRules) -> FrameImages:
+    """Read a frame for tracking: without its shading, unless tracking is that of the papers."""
+    images = load_images(footage, frame, rules.enhance)
+    if rules.tracking.scheme != "space":
+        return images
+    window_px, row_step = round(SHADING_PATCHES * rules.matching.patch_px), footage.take.rows_at(frame).step
+    level = [without_shading(image.grey, window_px, row_step=row_step) for image in images.spline]
+    return FrameImages(grey=level, spline=[SplineImage(grey) for grey in level])
 
 
 def _pair(images: FrameImages | None, after: FrameImages) -> FramePair | None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from tricap.core.images.enhance import EnhanceSettings, enhanced, texture_strength, wallis
+from tricap.core.images.enhance import EnhanceSettings, enhanced, texture_strength, wallis, without_shading
 from tricap.core.images.sampling import noise_sigma
 
 
@@ -21,6 +21,16 @@ def test_formula_at_a_pixel() -> None:
     c, b = s.contrast_share, s.mean_share
     expected = (image[70, 100] - m) * c * s.contrast / (c * sd + (1 - c) * s.contrast) + b * s.mean + (1 - b) * m
     assert wallis(image, s)[70, 100] == pytest.approx(expected, abs=0.02)
+
+
+def test_without_shading_texture_is_left() -> None:
+    """A ramp vanishes, and fine texture keeps its grey values but for the mean over the window, which has half as many rows in a field."""
+    texture = textured(20, 0.0, blur=1.0) - 120
+    ramp = np.add.outer(0.3 * np.arange(160), 0.5 * np.arange(200))
+    level = without_shading(texture + ramp, 13)[20:140, 20:180]
+    assert np.abs(level - without_shading(texture, 13)[20:140, 20:180]).max() < 1e-3
+    assert level[10, 10] == pytest.approx(texture[30, 30] - texture[24:37, 24:37].mean(), abs=1e-3)
+    assert without_shading(texture, 13, row_step=2)[30, 30] == pytest.approx(texture[30, 30] - texture[27:34, 24:37].mean(), abs=1e-3)
 
 
 def test_contrast_and_mean_become_alike() -> None:

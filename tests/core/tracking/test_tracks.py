@@ -55,6 +55,22 @@ def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced:
     assert seen.sum(axis=0).max() == FRAMES
 
 
+def test_shading_that_stays_in_place_does_not_hold_a_point_back(tmp_path: Path, scenes: Any) -> None:
+    """Weak texture that moves under light and shade: the points go with the texture."""
+    bodies, rig = moving_plane(scenes, FRAMES), scenes.three_cameras()
+    take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=0.0)
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
+    for file in sorted((tmp_path / "take").rglob("*.png")):
+        grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE).astype(float)
+        y, x = np.indices(grey.shape)
+        shaded = 128 + 0.15 * (grey - 128) + 40 * np.sin(x / 14) * np.cos(y / 17)
+        cv2.imwrite(str(file), np.rint(shaded))
+    tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 25.0)
+    error, on_it = errors(bodies, tracks, 0.035)
+    drift_px = np.linalg.norm(error[..., :2], axis=2)[:, on_it & tracks.visible[0]] / scenes.pixel_m
+    assert np.isfinite(drift_px[-1]).sum() > 30 and np.nanmedian(drift_px[-1]) < 0.2
+
+
 def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
     """Points of one field are found in the other, half a line away: no jitter from field to field."""
     bodies = moving_plane(scenes, 4)
