@@ -9,7 +9,8 @@ high correlation. A point is therefore tracked only while its patch lies on the 
 has the depth of that surface. Its depth is then replaced by the surface's, which is corrected for curvature (surface/local_surface.py).
 
 Light and shade stay in place while a body turns, and with them patches of weak texture, which slide over the body with a high correlation.
-The images are therefore tracked without their mean over about a patch (`without_shading`). Within one frame, shading is texture like any other.
+The images are therefore tracked without their mean over about a patch (`without_shading`). Within one frame, shading is texture like any
+other.
 """
 
 from collections.abc import Iterator, Sequence
