@@ -21,7 +21,7 @@ from ..core.foundation.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.interlace import BOTH, FieldLayout, field_layout
 from ..core.take.sources import PERSON_SOURCES
-from ..core.take.take import NO_BODY, TOP_LEVEL, Take
+from ..core.take.take import AUTO_BODY, NO_BODY, TOP_LEVEL, WHOLE_BODY, Take
 from ..core.take.take import body_model as take_body_model
 from ..core.take.writing import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import clicks, folders, properties
@@ -308,31 +308,33 @@ def _clip_of(clip: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.typ
 
 
 def _body(scene: bpy.types.Scene, old: Table) -> Table | None:
-    """[body]; left out if no body is chosen and the file has none."""
-    if model_of(scene):
-        return {**old.get("body", {}), "model": model_of(scene)}
-    return {"model": NO_BODY} if "body" in old or not old else None
+    """[body]; without a model if that is chosen by what is seen, and left out if it is empty."""
+    model, said = model_of(scene), {key: value for key, value in old.get("body", {}).items() if key != "model"}
+    if model == NO_BODY:
+        return {"model": NO_BODY}
+    return {**said, **({} if model == AUTO_BODY else {"model": model})} or None
 
 
 def model_of(scene: bpy.types.Scene) -> str:
-    """The body model as take.toml names it, "" for none."""
+    """The body model as take.toml names it, `AUTO_BODY` where it is left out."""
     props = scene.tricap
-    return {NO_BODY: "", "own": props.model_file}.get(props.model, props.model)
+    return str(props.model_file or NO_BODY) if props.model == "own" else str(props.model)
 
 
-def body_model(scene: bpy.types.Scene) -> str | None:
-    """The body model as `read_model` takes it, a file of the project with its path; None for none.
+def joints_model(scene: bpy.types.Scene) -> str | None:
+    """The model whose joints are clicked as `read_model` takes it, a file of the project with its path; None for none.
 
     Raises:
         InputError: the file is not in the project's folder.
     """
-    return take_body_model(folder_of(scene), model_of(scene) or None, "the panel")
+    name = take_body_model(folder_of(scene), model_of(scene), "the panel")
+    return WHOLE_BODY if name == AUTO_BODY else name
 
 
 def _show_model(scene: bpy.types.Scene, name: str) -> None:
     props = scene.tricap
     known = {item.identifier for item in props.bl_rna.properties["model"].enum_items}
-    props.model = name if name in known else "own" if name else NO_BODY
+    props.model = name if name in known else "own" if name else AUTO_BODY
     props.model_file = name if props.model == "own" else ""
 
 

@@ -8,15 +8,16 @@ from ..core.images.interlace import BOTH, INTERLACE
 from .scene.clips import frames_per_image
 from .session import get_session
 
-MODELS = (
-    ("none", "No Body", "Clouds and trajectories only"),
-    ("full", "Whole Body", "All limbs"),
-    ("upper_body", "Upper Body", "From the pelvis up, both arms"),
-    ("arm.R", "Right Arm", "Shoulder, elbow, wrist"),
-    ("arm.L", "Left Arm", "Shoulder, elbow, wrist"),
-    ("leg.R", "Right Leg", "Hip, knee, ankle"),
-    ("leg.L", "Left Leg", "Hip, knee, ankle"),
-    ("own", "Custom Model", "A .toml model in the project folder"),
+MODELS = (  # with the numbers that .blend files hold
+    ("auto", "Whole or Upper Body", "Whichever the images show", "NONE", 8),
+    ("none", "No Body", "Clouds and trajectories only", "NONE", 0),
+    ("full", "Whole Body", "All limbs", "NONE", 1),
+    ("upper_body", "Upper Body", "From the pelvis up, both arms", "NONE", 2),
+    ("arm.R", "Right Arm", "Shoulder, elbow, wrist", "NONE", 3),
+    ("arm.L", "Left Arm", "Shoulder, elbow, wrist", "NONE", 4),
+    ("leg.R", "Right Leg", "Hip, knee, ankle", "NONE", 5),
+    ("leg.L", "Left Leg", "Hip, knee, ankle", "NONE", 6),
+    ("own", "Custom Model", "A .toml model in the project folder", "NONE", 7),
 )
 FIELDS_USED = {
     "none": ("Progressive", "The footage is not interlaced"),
@@ -118,7 +119,7 @@ def annotations() -> dict[str, Any]:
         "first_frame": props.IntProperty(name="Frame Start", min=0, description="First frame to measure", **watched),
         "last_frame": props.IntProperty(name="End", min=0, description="Last frame to measure", **watched),
         "model": props.EnumProperty(
-            name="Body", items=MODELS, default="full", description="The part of the body that was recorded and is fitted", **watched
+            name="Body", items=MODELS, default="auto", description="The part of the body that was recorded and is fitted", **watched
         ),
         "model_file": props.StringProperty(name="Model File", description="Name of the .toml model in the project folder", **watched),
         "seed_frame": props.IntProperty(

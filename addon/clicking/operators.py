@@ -351,17 +351,17 @@ def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:
     Raises:
         InputError: none is chosen, or its file is invalid.
     """
-    if not project.model_of(scene):
+    if project.joints_model(scene) is None:
         raise InputError("Choose a body in step 3 first: it determines the joints to click.")
     return _model(scene).skeleton.joint_names
 
 
 def _depths(scene: bpy.types.Scene) -> dict[str, float]:
-    return joint_depths_m(_model(scene)) if project.model_of(scene) else {}
+    return joint_depths_m(_model(scene)) if project.joints_model(scene) else {}
 
 
 def _model(scene: bpy.types.Scene) -> BodyModel:
-    name = str(project.body_model(scene))
+    name = str(project.joints_model(scene))
     return read_model(name) if name.endswith(".toml") else _builtin_model(name)
 
 

@@ -82,7 +82,7 @@ def model_of(scene: bpy.types.Scene) -> BodyModel:
     Raises:
         InputError: none is chosen, or its file is faulty.
     """
-    name = project.body_model(scene)
+    name = project.joints_model(scene)
     if name is None:
         raise InputError("Choose a body model first; the degrees of freedom are those of the model.")
     return read_model(name)

@@ -10,6 +10,7 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
+from ...core.results.run_json import notes_of
 from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE, show_so_far
@@ -82,8 +83,8 @@ def run_and_read(
 def report_run(operator: Any, context: bpy.types.Context, run: "Run") -> None:
     """Show a run's warnings and its summary, and store the summary for the panel."""
     context.scene.tricap.last = str(run)
-    if run.footage.reference_note:
-        operator.report({"INFO"}, run.footage.reference_note)
+    for sentence in notes_of(run.record):
+        operator.report({"INFO"}, sentence)
     for sentence in run.record["warnings"]:
         operator.report({"WARNING"}, sentence)
     operator.report({"INFO"}, str(run))

@@ -131,7 +131,7 @@ def clicked_views(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     scene = context.scene
     clips = project.clips_of(scene)
     frame = scene.tricap.seed_frame
-    model = project.body_model(scene)
+    model = project.joints_model(scene)
     wanted = states.joints_of(model) if model else ()
     return [(name, [view for view, clip in clips.items() if clicks.get_click(clip, name, frame) is not None]) for name in wanted]
 

@@ -22,7 +22,7 @@ from ...core.results.run_json import read_run
 from ...core.run.settings import settings_of
 from ...core.take.clicked_points import clicked_depth
 from ...core.take.footage import Footage, footage_frames, open_take
-from ...core.take.take import Take
+from ...core.take.take import AUTO_BODY, Take
 from .. import folders, project
 from ..clicking.click_session import joints_of as joints_in_order
 from ..scene import stored
@@ -215,15 +215,15 @@ def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
         return State(status=Status.DONE, message="No body is fitted: surface and tracks need no clicks.")
     if take.keypoints:
         return State(status=Status.DONE, message="The take has keypoints of another system; clicks are optional.")
-    wanted = joints_of(take.body_model)
+    wanted = joints_of(str(take.joints_model))
     clicked = take.clicks.joints
     if found.footage is not None:
         _check_clicks(found.footage)
     complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
     if take.body_model in START_ALONE and len(complete) < len(wanted):
         others = f"{len(complete)} of {len(wanted)} joints are clicked, the others are" if complete else "The joints are"
-        part = "Choose another Body if only a part of the person is filmed."
-        message = f"{others} found by the fit, which asks for a click where it is not certain. {part}"
+        part = "" if take.body_model == AUTO_BODY else " Choose another Body if only a part of the person is filmed."
+        message = f"{others} found by the fit, which asks for a click where it is not certain.{part}"
         return State(status=Status.DONE, message=message)
     if len(complete) < min(NEEDED_JOINTS, len(wanted)):
         return State(status=Status.READY, message=f"Click each joint in at least two views: {len(complete)} of {len(wanted)} so far.")
@@ -303,6 +303,8 @@ def _figures(step: str, entry: Mapping[str, Any]) -> str:
     if step == "tracks":
         return f"{entry['trajectories']} trajectories, {entry['mean_length_frames']:.0f} frames long on average."
     text = f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
+    if "chosen_model" in entry:
+        text += f" The body is “{entry['chosen_model']}”, chosen by what is seen."
     for word in (GUESSED, INFERRED):
         limbs = {limb: n for limb, counts in entry.get("limbs", {}).items() if (n := counts.get(word, 0))}
         listed = ", ".join(f"{limb} in {n:.0f} {'frame' if n == 1 else 'frames'}" for limb, n in limbs.items())

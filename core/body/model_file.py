@@ -5,7 +5,7 @@ file the bones of the right side define both. A file with `part_of` is another m
 The other is a built-in one by its name, or a .toml file in the same folder.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from math import inf, radians
 from pathlib import Path
@@ -51,6 +51,12 @@ class BodyModel:
 def model_names() -> tuple[str, ...]:
     """The models that come with Tricap."""
     return tuple(sorted(path.name.removesuffix(".toml") for path in MODELS.glob("*.toml")))
+
+
+def smallest_model(joints: Set[str]) -> str:
+    """The model that comes with Tricap and has all of these joints, or as many as any, with the fewest bones."""
+    skeletons = {name: read_model(name).skeleton for name in model_names()}
+    return max(skeletons, key=lambda name: (len(joints & {*skeletons[name].joint_names}), -len(skeletons[name].bones)))
 
 
 def read_model(name: str | Path) -> BodyModel:

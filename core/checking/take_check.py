@@ -59,9 +59,9 @@ def joint_findings(take: Take) -> list[Finding]:
     Raises:
         InputError: there is no such body model.
     """
-    if take.body_model is None or take.keypoints:
+    if take.joints_model is None or take.keypoints:
         return []
-    joints = read_model(take.body_model).skeleton.joint_names
+    joints = read_model(take.joints_model).skeleton.joint_names
     clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
     if not clicked and take.body_model in START_ALONE:
@@ -178,11 +178,11 @@ def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tu
 def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
     """Pixels (n, 2) of the measured rows along each bone whose two joints are clicked in the reference view."""
     take = footage.take
-    if take.body_model is None:
+    if take.joints_model is None:
         return {}
     clicked = {name: at[view] for name, at in take.clicks.joints.items() if view in at}
     t = np.linspace(*ALONG, SAMPLES)[:, None]
-    bones = read_model(take.body_model).skeleton.bones
+    bones = read_model(take.joints_model).skeleton.bones
     return {
         b.name: take.rows_at(take.clicks.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
         for b in bones

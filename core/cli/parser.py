@@ -79,7 +79,10 @@ def _new(commands: Any) -> None:
     new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="the lines of interlaced video to measure")
     new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
     new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or a calibration of another tool")
-    about = f"the body model: {', '.join(model_names())}, your own .toml file, or none (surface and tracks only)"
+    about = (
+        f"the body model: {', '.join(model_names())}, your own .toml file, or none (surface and tracks only); "
+        "default: the whole person or the upper body, whichever is seen"
+    )
     new.add_argument("--model", default=None, metavar="NAME", help=about)
 
 

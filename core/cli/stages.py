@@ -9,6 +9,7 @@ from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..report.film import write_film
 from ..results.folder import check_separate_folder
+from ..results.run_json import notes_of
 from ..run import pipeline, take_run
 from ..run.engine import Engine, of_this_machine
 from ..run.settings import settings_of
@@ -147,7 +148,7 @@ def _films(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> li
 def _summary(job: take_run.Run, as_json: bool) -> list[str]:
     if as_json:
         return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
-    notes = [note for note in (job.footage.reference_note, *job.record["warnings"]) if note]
+    notes = [*notes_of(job.record), *job.record["warnings"]]
     return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in notes)]
 
 

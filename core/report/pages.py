@@ -19,6 +19,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..results.folder import Results
+from ..results.run_json import notes_of
 from ..surface.cloud import PointCloud
 from ..take.footage import Footage
 from ..tracking.trajectories import Trajectories
@@ -263,7 +264,7 @@ def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, by
     body = (
         f'<h1>{html.escape(take)}</h1><p class="verdict"><b>{html.escape(headline(record, report.body, len(report.doubtful)))}</b> '
         f'{html.escape(verdict(record, report.body))}</p><p class="soft">{html.escape(_facts(record))}</p>'
-        + notes([*filter(None, [record.get("reference_note")]), *record["warnings"]])
+        + notes([*notes_of(record), *record["warnings"]])
         + _first_screen(report, shots)
         + f"<nav>{links}</nav>"
         + "".join(f'<h2 id="part{n}">{title}</h2>{content}' for n, (title, content) in enumerate(sections))

@@ -17,6 +17,9 @@ STAGE_FIGURES = {  # figures that a finished stage must have
     "track": ("trajectories", "mean_length_frames"),
     "fit": ("joint_sigma_mm",),
 }
+SEEN = {"full": "the whole person is seen", "upper_body": "the images cut the person below"}  # why a model was chosen
+JOINTS = "it has the joints that are located"
+STAGE_WORDS = ("key", "not_done", "chosen_model")
 LARGEST_FIGURE = 1e12  # far above every figure of a run
 
 
@@ -36,6 +39,17 @@ def read_run(path: Path) -> dict[str, Any]:
     return run
 
 
+def notes_of(run: Mapping[str, Any]) -> list[str]:
+    """What a run decided by itself: the reference view and the body model, a sentence each."""
+    fit = run.get("stages", {}).get("fit", {})
+    notes = [run.get("reference_note", "")]
+    if "chosen_model" in fit:
+        chosen = fit["chosen_model"]
+        why = SEEN.get(chosen, JOINTS) if "start" in fit else JOINTS
+        notes.append(f"The body is “{chosen}”: {why}. For another one, write `model` under [body] of take.toml, or choose it in step 3.")
+    return [note for note in notes if note]
+
+
 def _invalid_table(run: Mapping[str, Any]) -> str | None:
     if any(not isinstance(table, dict) for table in run.get("settings", {}).values()):
         return "settings"
@@ -49,7 +63,7 @@ def _invalid_table(run: Mapping[str, Any]) -> str | None:
 def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
     """The first stage with an invalid entry."""
     for stage, entry in stages.items():
-        if not isinstance(entry, dict) or not isinstance(entry.get("key", ""), str) or not isinstance(entry.get("not_done", ""), str):
+        if not isinstance(entry, dict) or any(not isinstance(entry.get(name, ""), str) for name in STAGE_WORDS):
             return stage
         if "not_done" not in entry and any(not is_figure(entry.get(name)) for name in STAGE_FIGURES.get(stage, ())):
             return stage

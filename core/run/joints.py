@@ -42,7 +42,7 @@ def joints_of_take(take_folder: Path, overrides: Overrides | None, monitor: Moni
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     if take.body_model is None:
         raise InputError(
-            'take.toml has no [body] model, so there are no joints to find; write model = "full" or "upper_body" under [body].'
+            'take.toml has model = "none" under [body], so there are no joints to find; write "full" or "upper_body", or leave it out.'
         )
     clouds = _some_clouds(footage, settings, monitor.part("surface", 0, 2))
     background = find_background(footage, clouds, monitor) if settings["fitting"].use_background else []
@@ -52,7 +52,10 @@ def joints_of_take(take_folder: Path, overrides: Overrides | None, monitor: Moni
         given = fit_input(footage, completed, None, results, background)
         start = find_joints(given, settings["fitting"], monitor.part("find the person", 1, 2))
     if start is None:
-        raise InputError("Nobody was found: no frame has enough measured points of a person who is wholly inside the middle view.")
+        raise InputError(
+            "Nobody was found: no frame has enough measured points of a person who is wholly inside the middle view, or cut by nothing but "
+            "its lower border."
+        )
     return footage, start, settings
 
 

@@ -47,6 +47,7 @@ from ..surface.cloud import as_written, write_cloud
 from ..surface.frames import FrameSummary, MeasuredFrames, summary_of
 from ..surface.measure import NothingMeasured, measure_frames
 from ..surface.starts import MeasureSettings
+from ..take.take import AUTO_BODY
 from ..tracking.corrections import corrected_tracks, missed_clicks
 from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
@@ -107,7 +108,7 @@ def track(run: Run, monitor: Monitor) -> None:
 def fit(run: Run, monitor: Monitor) -> None:
     """The body's shape and motion: body.toml, joints.csv, motion.csv, skin/. Measures and tracks first where that is needed.
 
-    A take without a model has no body; run.json says so. Without clicked joints the body starts by itself where that is certain.
+    A take with model = "none" has no body; run.json says so. Without clicked joints the body starts by itself where that is certain.
 
     Raises:
         InputError: the clicks contradict each other, more are needed for a start, or the limb has no points.
@@ -131,7 +132,9 @@ def fit(run: Run, monitor: Monitor) -> None:
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
-    noted = {"start": start_figures(given.start)} if given.start is not None else {}
+    noted: dict[str, Any] = {"start": start_figures(given.start)} if given.start is not None else {}
+    if run.footage.take.body_model == AUTO_BODY:
+        noted["chosen_model"] = given.model
     noted[FITTED_WITH] = fitted_with(run.footage, run.settings, run.results.folder)
     run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **noted)
 
@@ -270,7 +273,7 @@ def _prepare_fit(run: Run, monitor: Monitor) -> None:
 
 def _no_body(run: Run, missing: str, began: float, why: str = "") -> None:
     """Record that there is nothing to fit; a take that wants no body is not warned."""
-    if not run.footage.take.no_body:
+    if run.footage.take.body_model is not None:
         run.warn(f"No body was fitted: take.toml has {missing}. {why}".strip())
     run.finish_stage("fit", began, not_done=missing)
 

@@ -63,9 +63,9 @@ def _track_input(footage: Footage) -> Any:
 
 def _fit_input(footage: Footage) -> Any:
     take = footage.take
-    model = NO_BODY if take.no_body else take.body_model
-    own = store.digest(*model_files(model)) if model and model.endswith(".toml") else ""
-    named = Path(model).name if model and own else model
+    model = take.body_model or NO_BODY
+    own = store.digest(*model_files(model)) if model.endswith(".toml") else ""
+    named = Path(model).name if own else model
     return (
         named,
         own,

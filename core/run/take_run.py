@@ -131,8 +131,8 @@ def open_run(
         footage = only_frames(footage, frames)
     for name, at in take.clicks.joints.items():
         clicked_depth(footage, name, at)
-    if take.body_model is not None:
-        read_model(take.body_model)
+    if take.joints_model is not None:
+        read_model(take.joints_model)
     check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
     check_pictured(footage.frames, pictures)
     keys = stage_keys(footage, settings, Path(out))

@@ -28,10 +28,10 @@ def measured_footage(footage: Footage, quality: str, spacing_px: int) -> Footage
         InputError: the clicks contradict each other, or the model is unknown.
     """
     take = footage.take
-    if quality != "motion" or take.body_model is None or not take.clicks.joints or take.interlaced != "none":
+    if quality != "motion" or take.joints_model is None or not take.clicks.joints or take.interlaced != "none":
         return footage
     depth = float(np.median([clicked_depth(footage, name, at) for name, at in take.clicks.joints.items()]))
-    factor = np.sqrt(seen_area_m2(take.body_model) / POINTS) / spacing_px * footage.rig.cameras[take.reference].focal_px / depth  # (1)
+    factor = np.sqrt(seen_area_m2(take.joints_model) / POINTS) / spacing_px * footage.rig.cameras[take.reference].focal_px / depth  # (1)
     return footage.reduced(float(factor)) if factor >= LEAST_FACTOR else footage
 
 

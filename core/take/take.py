@@ -62,7 +62,8 @@ KEYS = (
 TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys of take.toml itself, and their groups
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
-NO_BODY = "none"  # `model` under [body]
+NO_BODY, AUTO_BODY = "none", "auto"  # `model` under [body]; the latter where nothing is said
+WHOLE_BODY = "full"  # the model that has all joints
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -151,8 +152,7 @@ class Take:
     reference_view: str = ""
     reference_chosen: bool = True  # by take.toml; otherwise it is the middle one, and `open_take` may take another
     frames: tuple[int, int] | None = None
-    body_model: str | None = None  # the name of one of ours, or the absolute path of the take's own; None: no body
-    no_body: bool = False  # the take asks for surface and tracks only: model = "none"
+    body_model: str | None = AUTO_BODY  # the name of one of ours, or the absolute path of the take's own; None: surface and tracks only
     locked: tuple[str, ...] = ()  # degrees of freedom fixed at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
     clicks: FrameClicks = field(default_factory=FrameClicks)
@@ -186,6 +186,11 @@ class Take:
         clicks, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.clicks, *self.keyframes))
         frames = None if self.frames is None else (self.frames[0] // 2, (self.frames[1] + 1) // 2)
         return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, clicks=clicks, keyframes=tuple(keys))
+
+    @property
+    def joints_model(self) -> str | None:
+        """The model whose joints can be clicked: that of the whole person until one is chosen."""
+        return WHOLE_BODY if self.body_model == AUTO_BODY else self.body_model
 
     @property
     def reference(self) -> int:
@@ -260,7 +265,6 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         reference_chosen="reference_view" in table,
         frames=frame_pair(table.get("frames"), where),
         body_model=body_model(folder, body.get("model"), where),
-        no_body=body.get("model") == NO_BODY,
         locked=_locked(body.get("locked", []), where),
         limits=_limits(body.get("limits", {}), where),
         clicks=_frame_clicks(table_of(table, "seeds", where), names, where),
@@ -388,11 +392,14 @@ def _settings(take: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, 
 
 
 def body_model(folder: Path, name: str | None, where: str) -> str | None:
-    """`model` of [body] as `read_model` takes it: the name of one of ours, or the path of the take's own .toml file; None: no body.
+    """`model` of [body]: the name of one of ours, or the path of the take's own .toml file, as `read_model` takes it; `AUTO_BODY` where
+    nothing is said, None for no body.
 
     Raises:
         InputError: the file does not lie in the take's folder.
     """
-    if name is None or name == NO_BODY:
+    if name is None:
+        return AUTO_BODY
+    if name == NO_BODY:
         return None
     return str(inside(folder, name, where, "model")) if name.endswith(".toml") else name

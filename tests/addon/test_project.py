@@ -140,19 +140,19 @@ def test_a_model_of_ones_own_tells_which_joints_to_click(project: ModuleType, bl
 
 
 def test_no_body_is_read_and_written(project: ModuleType, blender: ModuleType, take: Path) -> None:
-    """The panel writes that no body is wanted; a file that says nothing of a body stays as it is."""
+    """The panel writes that no body is wanted; a file that says nothing of a body stays as it is: what is seen decides."""
     scene = blender.context.scene
     without = {key: value for key, value in read_table(take).items() if key != "body"}
-    for said, shown, then in ((without, "none", None), (without | {"body": {"model": "none"}}, "none", {"model": "none"})):
+    for said, shown, then in ((without, "auto", None), (without | {"body": {"model": "none"}}, "none", {"model": "none"})):
         write_table(take, said)
         project.open_take(scene, take)
         assert scene.tricap.model == shown and project.table(scene).get("body") == then
-        assert project.body_model(scene) is None
+        assert project.joints_model(scene) == {"auto": "full", "none": None}[shown]
     scene.tricap.model = "arm.R"
     project.write(scene)
     scene.tricap.model = "none"
     project.write(scene)
-    assert read_table(take)["body"] == {"model": "none"} and take_of_table(take, read_table(take)).no_body
+    assert read_table(take)["body"] == {"model": "none"} and take_of_table(take, read_table(take)).body_model is None
 
 
 def test_the_quality_is_a_key_of_the_take(project: ModuleType, blender: ModuleType, take: Path) -> None:

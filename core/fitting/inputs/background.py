@@ -270,7 +270,7 @@ def _clicked_limbs(
     """Cells (h, w) of every view along those clicked limbs that look like the background in the click's frame, and were not measured."""
     take = footage.take
     masks = {k: np.zeros(b.grey.shape, bool) for k, b in backgrounds.items()}
-    skeleton = read_model(str(take.body_model)).skeleton
+    skeleton = read_model(str(take.joints_model)).skeleton
     for clicked in (take.clicks, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
             images = footage.read(clicked.frame)

@@ -87,7 +87,7 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     take, clicks = footage.take, clicks_in(footage)
     if missing_for_fit(footage):
         return
-    model = with_limits(read_model(str(take.body_model)), take.limits, take.locked)
+    model = with_limits(read_model(str(take.joints_model)), take.limits, take.locked)
     names = model.skeleton.joint_names
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if places and not take.keypoints and take.body_model not in START_ALONE:
@@ -97,10 +97,7 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
 
 def missing_for_fit(footage: Footage) -> str:
     """Why no body can be fitted in these frames, as the end of “take.toml has …”; empty: it can."""
-    take = footage.take
-    if take.body_model is None:
-        return 'model = "none" under [body]' if take.no_body else "no [body] model"
-    return ""
+    return 'model = "none" under [body]' if footage.take.body_model is None else ""
 
 
 def clicks_left_out(footage: Footage) -> list[str]:

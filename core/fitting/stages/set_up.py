@@ -1,15 +1,16 @@
 """What a fit begins with: its context from the input, and the start from clicks and keypoints, or without them (`start`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from ...body.model_file import BodyModel, read_model, with_limits
+from ...body.model_file import BodyModel, read_model, smallest_model, with_limits
 from ...body.shape import BodyShape, default_shape, one_ball_shape, scaled_shape
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
+from ...take.take import AUTO_BODY, WHOLE_BODY
 from ..context import FitContext
 from ..inputs.background import BackgroundRegions
 from ..inputs.clicks import Clicks, initial_clicks, read_clicks
@@ -23,14 +24,16 @@ from ..observations.self_collision import CollisionPairs
 from ..settings import FitSettings
 from ..solve.time_priors import LEAST, typical_acceleration
 from ..start.find import find_start
+from ..start.search import Framing
 from ..state import ShapeParameters
 from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors, trunk_joints
 from .long_sequence import AT_ONCE
 
 FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
+LEAST_PERSON = 0.2  # where no model is chosen, what starts with a smaller probability is taken for no person
 FOUND = tuple(f"{joint}{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in (".L", ".R"))
 LEAST_ANGULAR = 0.3  # of the largest sigmas of angular accelerations: 1,800°/s², as elbows and knees have
-WHOLE = "full"  # the model that is looked for, whatever part of it is fitted
+PERSONS = {Framing.WHOLE: WHOLE_BODY, Framing.UPPER: "upper_body"}  # the models that are looked for, whatever part of them is fitted
 
 
 class NobodyFound(InputError):
@@ -73,30 +76,59 @@ def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
 def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitInput:
     """The input with the start that is found without clicks, or with few of them, where the fit needs one.
 
+    Where no model is chosen (`AUTO_BODY`), it is that of what is seen, or else the smallest one that has the clicked joints.
+
     Raises:
-        NobodyFound: no frame has enough points of a person.
+        NobodyFound: no frame has enough points of a person, and there are too few clicks.
         NeedsClick: it is not certain how the person stands.
         Cancelled: the user asked to stop.
     """
-    if given.start is not None or not needs_start(given, settings):
+    is_chosen = given.model != AUTO_BODY
+    if given.start is not None or (is_chosen and not needs_start(given, settings)):
         return given
-    start = find_joints(given, settings, monitor)
+    start = None if given.keypoints else find_joints(given, settings, monitor)
+    if not is_chosen:
+        located = _located_joints(given, settings)
+        given = _of_model(given, start.model if start is not None else smallest_model(located) if located else WHOLE_BODY)
+        if not needs_start(given, settings):
+            return given
     certain = start is not None and start.probability >= settings.least_start_probability
-    if start is None or (given.model != WHOLE and not certain):  # a part of a person is started by clicks on it, not elsewhere
-        skeleton = read_model(given.model).skeleton
-        trunk = trunk_joints(skeleton)
-        joints = (
-            f"three of the joints {', '.join(trunk)}"
-            if len(trunk) > LEAST_TRUNK_JOINTS
-            else "two of the joints " + ", ".join(skeleton.joint_names)
-        )
-        raise NobodyFound(
-            "The body cannot start by itself: no frame has enough measured points of a person who is wholly inside the middle view. "
-            f"Click at least {joints} in two views each, under [seeds.joints] or in Blender (step 3)."
-        )
+    if start is None or (given.model not in PERSONS.values() and not certain):  # a limb is started by clicks on it, not elsewhere
+        raise NobodyFound(_nobody_found(given.model, is_chosen))
+    if not is_chosen and not given.clicks and start.probability < LEAST_PERSON:
+        raise NobodyFound(f"It may be no person that is seen. {start.question}")
     if not certain:
         raise NeedsClick(start)
     return replace(given, start=start)
+
+
+def _nobody_found(model: str, is_chosen: bool) -> str:
+    """Why the body of a model cannot start, and what to do."""
+    skeleton = read_model(model).skeleton
+    trunk = trunk_joints(skeleton)
+    many = len(trunk) > LEAST_TRUNK_JOINTS
+    joints = f"three of the joints {', '.join(trunk)}" if many else f"two of the joints {', '.join(skeleton.joint_names)}"
+    cut = "" if is_chosen and model == WHOLE_BODY else ", or cut by nothing but its lower border"
+    limb = "" if is_chosen else ", or choose the limb that is filmed as the model under [body], and click its joints"
+    return (
+        "The body cannot start by itself: no frame has enough measured points of a person who is wholly inside the middle view"
+        f"{cut}. Click at least {joints} in two views each, under [seeds.joints] or in Blender (step 3){limb}."
+    )
+
+
+def _of_model(given: FitInput, model: str) -> FitInput:
+    """The input for another model: with the limits that it has, too."""
+    dofs = {dof.name for dof in read_model(model).skeleton.dofs}
+    limits = {name: limit for name, limit in given.limits.items() if name in dofs}
+    return replace(given, model=model, limits=limits, locked=tuple(name for name in given.locked if name in dofs))
+
+
+def _located_joints(given: FitInput, settings: FitSettings) -> set[str]:
+    """The joints of keypoints, and those that are clicked in two views."""
+    names = read_model(WHOLE_BODY).skeleton.joint_names
+    clicked = clicks_by_frame(given, names, settings)[1].values()
+    located = {name for xyz in clicked for name, place in zip(names, xyz) if np.isfinite(place).all()}
+    return located.union(*(source.joint for source in given.keypoints))
 
 
 def needs_start(given: FitInput, settings: FitSettings) -> bool:
@@ -121,34 +153,43 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
         InputError: clicks contradict each other.
         Cancelled: the user asked to stop.
     """
-    given = given if given.model == WHOLE else replace(given, model=WHOLE, limits={}, locked=())
     clouds = given.clouds
 
     @lru_cache(maxsize=64)
     def points_of(t: int) -> CloudPoints:
         return thinned(clouds[t], settings.voxel_m)
 
-    middle = points_of(len(clouds) // 2).xyz_m
-    found = with_limits(read_model(given.model), given.limits, given.locked)
-    names = found.skeleton.joint_names
+    for shown, model in PERSONS.items():
+        if given.model == WHOLE_BODY != model:
+            break  # a whole body is not begun by a part of it
+        part = given if given.model == model else replace(given, model=model, limits={}, locked=())
+        fit = replace(_without_start(part, settings, points_of), monitor=monitor)
+        if (start := find_start(fit, points_of, given.frames, given.time_s, monitor, shown, without)) is not None:
+            return start
+    return None
+
+
+def _without_start(given: FitInput, settings: FitSettings, points_of: Callable[[int], CloudPoints]) -> FitContext:
+    """A context for a search: the clicks are no start."""
+    middle = points_of(len(given.clouds) // 2).xyz_m
+    model = with_limits(read_model(given.model), given.limits, given.locked)
+    names = model.skeleton.joint_names
     clicked, places = clicks_by_frame(given, names, settings)
-    nowhere = np.full((len(names), 3), np.nan)
-    fit = context_of(
+    return context_of(
         given,
         settings,
-        found,
-        _model_shape(found, settings),
+        model,
+        _model_shape(model, settings),
         stature_sigma=FOUND_STATURE_SIGMA,
         located=np.zeros(len(names), dtype=bool),
-        clicks=Clicks(observations=(), xyz_m=nowhere),
+        clicks=Clicks(observations=(), xyz_m=np.full((len(names), 3), np.nan)),
         click=0,
-        priors=dof_priors(found.skeleton, np.radians(settings.limit_sigma_deg), np.median(middle, axis=0) if len(middle) else np.zeros(3)),
+        priors=dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.median(middle, axis=0) if len(middle) else np.zeros(3)),
         clicked=clicked,
         places=places,
         tracks=JointTracks(given, names),
         found=FOUND,
     )
-    return find_start(replace(fit, monitor=monitor), points_of, given.frames, given.time_s, monitor, without)
 
 
 def context_of(given: FitInput, settings: FitSettings, model: BodyModel, shape: BodyShape, **own: object) -> FitContext:

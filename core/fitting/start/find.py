@@ -32,7 +32,6 @@ from ..inputs.start_joints import StartJoints
 from .limb_places import LimbPlaces, limb_places
 from .pose_dictionary import known_poses
 from .refine import (
-    EXCHANGES,
     LEAST_POINTS,
     ROUNDS,
     STAGE,
@@ -40,6 +39,7 @@ from .refine import (
     adjusted,
     carried,
     exchanged,
+    exchanges_of,
     missed_m,
     of_hypothesis,
     thinned_points,
@@ -47,7 +47,7 @@ from .refine import (
     with_lengths,
     with_limbs,
 )
-from .search import hypotheses, is_inside
+from .search import Framing, framing, hypotheses
 
 LOOKED_AT = 24  # frames of which the easiest is searched, and of those around it
 OUTLINE = 3.0  # voxels, by ray of an outline
@@ -101,17 +101,18 @@ def find_start(
     frames: Sequence[int],
     time_s: np.ndarray,
     monitor: Monitor,
+    shown: Framing,
     without: tuple[str, ...] = (),
 ) -> StartJoints | None:
-    """The joints where the fit begins; None where no frame has enough points.
+    """The joints where the fit begins; None where no frame has enough points and shows so much of the person as `shown`.
 
-    `fit`: a body of the whole person, without the joints of clicks as a start. `points_of(t)`: the points of frame index
+    `fit`: a body of that part, without the joints of clicks as a start. `points_of(t)`: the points of frame index
     t. `without`: recordings of the pose dictionary that are left out.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    chosen = easiest_frames(fit, points_of, time_s, monitor)
+    chosen = easiest_frames(fit, points_of, time_s, monitor, shown)
     if not chosen:
         return None
     known, names = known_poses(fit.model.skeleton, without), fit.model.skeleton.joint_names
@@ -164,13 +165,15 @@ def _everywhere(
     ]
 
 
-def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], time_s: np.ndarray, monitor: Monitor) -> list[int]:
+def easiest_frames(
+    fit: FitContext, points_of: Callable[[int], CloudPoints], time_s: np.ndarray, monitor: Monitor, shown: Framing = Framing.WHOLE
+) -> list[int]:
     """The frame indices to search: the easiest one, of those with clicks if there are any, then the easiest ones around it (`AROUND_S`).
 
-    Only frames with enough points, in which the image shows the whole person.
+    Only frames with enough points, in which the image shows so much of the person.
     """
     chosen, some = list[int](), sorted(fit.clicked) or _spread(np.arange(len(time_s)), LOOKED_AT)
-    while len(chosen) < SEARCHED and (easiest := _easiest(fit, points_of, some, monitor)) is not None:
+    while len(chosen) < SEARCHED and (easiest := _easiest(fit, points_of, some, monitor, shown)) is not None:
         chosen.append(easiest)
         apart = np.abs(time_s[:, None] - time_s[chosen])
         some = _spread(np.flatnonzero((apart >= AROUND_S[0]).all(axis=1) & (apart[:, 0] <= AROUND_S[1])), LOOKED_AT)
@@ -182,14 +185,14 @@ def _spread(rows: np.ndarray, count: int) -> list[int]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))].tolist()
 
 
-def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Sequence[int], monitor: Monitor) -> int | None:
-    ease = dict[int, float]()
+def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Sequence[int], monitor: Monitor, shown: Framing) -> int | None:
+    ease, middle = dict[int, float](), fit.cameras[len(fit.cameras) // 2]
     for t in some:
         monitor.check()
         points = points_of(t)
         if len(points.xyz_m) >= LEAST_POINTS:
             ease[t] = _ease(fit, t, points)
-    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if is_inside(fit.seen(t, points_of(t)))), None)
+    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if framing(fit.seen(t, points_of(t)), middle) is shown), None)
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:
@@ -236,7 +239,7 @@ def _explained(
     tried.sort(key=lambda one: -one.score)
     complete = [_complete(fit, thin, one, monitor.part(STAGE, 8 + i, 20)) for i, one in enumerate(tried[:COMPLETED])]
     best = max(complete, key=lambda one: one.score)
-    rivals = [exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20)) for i, parts in enumerate(EXCHANGES.values())]
+    rivals = [exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20)) for i, parts in enumerate(exchanges_of(fit).values())]
     frame = judged(fit, [Followed(found=one) for one in (*complete, *rivals)], {t: velocity})
     return [one.found for one, p in zip(frame.followed[:FOLLOWED], frame.probability.tolist()) if p >= LEAST_RIVAL]
 

@@ -45,6 +45,12 @@ class Explanation:
     joints_m: np.ndarray  # (J, 3)
 
 
+def exchanges_of(fit: FitContext) -> dict[str, tuple[str, ...]]:
+    """The exchanges (`EXCHANGES`) that change anything of a body: not those of legs that it does not have."""
+    parts = {name.partition(".")[0] for name in fit.model.skeleton.joint_names}
+    return {name: joints for name, joints in EXCHANGES.items() if parts & {*joints}}
+
+
 def explanation(fit: FitContext, t: int, points: CloudPoints, pose: np.ndarray, vector: np.ndarray) -> Explanation:
     """A pose with its score: `FitContext.score`, less the penalty for missed clicks."""
     joints, score = fit.parameters.state(pose, vector).joints_m, fit.score(t, points, pose, vector)

@@ -1,11 +1,14 @@
 """Poses all around in one frame: every known pose in every heading, where the outline and the measured points place it.
 
 A pose is scaled to the height of the person's region in the middle view, centred on it, and moved in depth until the surface that it turns
-to the camera has the median depth of the points. What it then explains is `explained.body_gains`; the stature's prior and clicks count as
+to the camera has the median depth of the points. Where the image cuts the person below, poses of several statures hang from the region's
+top, and only what is inside the image counts. What a pose then explains is `explained.body_gains`; the stature's prior and clicks count as
 penalties in the same unit, voxels of the cloud.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -28,6 +31,17 @@ ENDS = 0.002  # of the cells: the quantile that is the region's top, and its bot
 CLICK_M, CLICK_PENALTY, MOST_MISSES = 0.12, 60.0, 9.0  # distance from a click that costs so many voxels, and the most such squares
 BATCH = 512  # poses at a time: memory
 BORDER = 1.5  # cells from the image's border
+BORDER_PX, CUT = 16.0, 0.8  # where there are no cells: two patches; and the density of points there over the mean, more than that of feet
+STATURES_CUT = (0.9, 1.0, 1.1)  # over the model's, of a person who is cut below
+LOWEST_M = 0.4  # what is seen of a person is at least so high
+
+
+class Framing(Enum):
+    """How much of the person the middle view shows."""
+
+    WHOLE = "the whole person"
+    UPPER = "the upper part: the image's lower border cuts the person"
+    CUT = "a part: another border cuts the person, or it is no person"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +67,7 @@ class _Region:
     top_m: float
     bottom_m: float
     depth_m: float
+    framing: Framing
 
 
 def scaled_vector(parameters: ShapeParameters, stature: float) -> np.ndarray:
@@ -64,7 +79,7 @@ def scaled_vector(parameters: ShapeParameters, stature: float) -> np.ndarray:
 
 
 def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray) -> Hypotheses:
-    """The known poses (K, D) in all headings in frame index `t`, in which the person is wholly visible."""
+    """The known poses (K, D) in all headings in frame index `t`, which shows the whole person, or the upper part."""
     parameters, skeleton = fit.parameters, fit.model.skeleton
     middle = fit.cameras[len(fit.cameras) // 2]
     region = _region(evidence, middle)
@@ -73,11 +88,13 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray) -
     poses, stature = [], []
     for k in range(HEADINGS):
         angle = 2 * np.pi * k / HEADINGS
-        turned = known.copy()
-        turned[:, skeleton.layout[f"{skeleton.joint_names[0]} rotation"]] += angle
-        turned[:, skeleton.layout.group("base")], size = _places(region, *_flesh(rest, at_origin, angle))
-        poses.append(turned)
-        stature.append(size)
+        flesh = _flesh(rest, at_origin, angle)
+        for base, size in [_places(region, *flesh)] if region.framing is Framing.WHOLE else _hanging(region, *flesh):
+            turned = known.copy()
+            turned[:, skeleton.layout[f"{skeleton.joint_names[0]} rotation"]] += angle
+            turned[:, skeleton.layout.group("base")] = base
+            poses.append(turned)
+            stature.append(size)
     all_poses, sizes = np.concatenate(poses), np.concatenate(stature)
     for _ in range(COARSER):
         evidence = evidence.thinned()
@@ -91,13 +108,21 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray) -
     return Hypotheses(poses=all_poses, stature=sizes, score=score - _misses(fit, t, all_poses, sizes))
 
 
-def is_inside(evidence: Evidence) -> bool:
-    """Whether no border of the image cuts the person in the middle view."""
-    if not evidence.cells:
-        return True
-    view = evidence.cells[len(evidence.cells) // 2]
-    near, size = BORDER * view.distance.step_px, np.array(view.camera.size_px)
-    return bool((view.xy_px.min(axis=0) >= near).all() and (view.xy_px.max(axis=0) <= size - 1 - near).all())
+def framing(evidence: Evidence, camera: Camera) -> Framing:
+    """Which borders of an image cut the person: those that the person's cells touch, or where the background is not known, many points."""
+    views = [view for view in evidence.cells if view.camera.name == camera.name]
+    size, X = np.array(camera.size_px), evidence.points.xyz_m
+    if views:
+        near, few, xy = BORDER * views[0].distance.step_px, np.zeros(2), views[0].xy_px
+    else:
+        near, xy = BORDER_PX, camera.project(X)
+        few = CUT * len(X) * near / np.maximum(np.ptp(xy, axis=0), near) if len(X) else np.zeros(2)
+    if not len(X) or not len(xy) or np.ptp(xy[:, 1]) * float(np.median(camera.to_camera(X)[:, 2])) / camera.focal_px < LOWEST_M:
+        return Framing.CUT
+    (left, top), (right, below) = (xy < near).sum(axis=0) > few, (xy > size - 1 - near).sum(axis=0) > few
+    if left or right or top:
+        return Framing.CUT
+    return Framing.UPPER if below else Framing.WHOLE
 
 
 def _region(evidence: Evidence, camera: Camera) -> _Region:
@@ -108,7 +133,14 @@ def _region(evidence: Evidence, camera: Camera) -> _Region:
     across, down = (rays[:, :2] / rays[:, 2:] * depth).T
     top, bottom = np.quantile(down, [ENDS, 1 - ENDS])
     half = 0.5 * views[0].distance.step_px * depth / camera.focal_px if views else 0.0
-    return _Region(camera=camera, middle_m=float(across.mean()), top_m=float(top) - half, bottom_m=float(bottom) + half, depth_m=depth)
+    return _Region(
+        camera=camera,
+        middle_m=float(across.mean()),
+        top_m=float(top) - half,
+        bottom_m=float(bottom) + half,
+        depth_m=depth,
+        framing=framing(evidence, camera),
+    )
 
 
 def _flesh(rest: BodyState, at_origin: tuple[np.ndarray, np.ndarray], angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,6 +167,24 @@ def _places(region: _Region, X: np.ndarray, radius: np.ndarray, area: np.ndarray
         axis=1,
     )
     return region.camera.centre_m + at @ region.camera.R_cam_world, size
+
+
+def _hanging(region: _Region, X: np.ndarray, radius: np.ndarray, area: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """As `_places`, of a person who is cut below, for one stature after the other."""
+    across, down, depth = np.moveaxis(X @ region.camera.R_cam_world.T, -1, 0)
+    top = (down - radius).min(axis=1)
+    for size in STATURES_CUT:
+        seen = size * (down - top[:, None]) < region.bottom_m - region.top_m
+        share = np.where(seen, area, 0.0)
+        at = np.stack(
+            [
+                region.middle_m - size * (across * share).sum(axis=1) / share.sum(axis=1),
+                region.top_m - size * top,
+                region.depth_m - size * np.nanmedian(np.where(seen, depth - FACING * radius, np.nan), axis=1),
+            ],
+            axis=1,
+        )
+        yield region.camera.centre_m + at @ region.camera.R_cam_world, np.full(len(X), size)
 
 
 def _misses(fit: FitContext, t: int, poses: np.ndarray, stature: np.ndarray) -> np.ndarray:

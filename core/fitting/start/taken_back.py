@@ -9,7 +9,7 @@ from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
-from .refine import EXCHANGES, LEAST_POINTS, ROUNDS, STAGE, adjusted, exchanged, explanation, thinned_points
+from .refine import LEAST_POINTS, ROUNDS, STAGE, adjusted, exchanged, exchanges_of, explanation, thinned_points
 
 PLACES = (0.15, 0.5, 0.85)  # in the recording, of the frames that are judged
 MORE = 120.0  # voxels by which a rival must explain more of them together
@@ -26,11 +26,12 @@ def taken_back(
     """
     frames = np.unique((np.array(PLACES) * (len(motion) - 1)).round().astype(int)).tolist()
     judged = [t for t in frames if len(points[t].xyz_m) >= LEAST_POINTS]
-    more = dict.fromkeys(EXCHANGES, 0.0)
+    exchanges = exchanges_of(fit)
+    more = dict.fromkeys(exchanges, 0.0)
     for i, t in enumerate(judged):
         part, thin = monitor.part(STAGE, i, len(judged)), thinned_points(points[t])
         found = adjusted(fit, thin, explanation(fit, t, thin, motion[t], vector), ROUNDS[-1:], part)
-        for name, joints in EXCHANGES.items():
+        for name, joints in exchanges.items():
             more[name] += exchanged(fit, thin, found, joints, part, close=-np.inf).score - found.score
     if not more or max(more.values()) < MORE:
         return None

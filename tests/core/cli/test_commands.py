@@ -318,7 +318,7 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
 def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capture) -> None:
     views = [f"{name}={take / name}" for name in "LCR"]
     assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
-    assert read_take(tmp_path / "new").no_body and "click" not in capfd.readouterr().out
+    assert read_take(tmp_path / "new").body_model is None and "click" not in capfd.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -19,14 +19,14 @@ from tricap.core.tracking.contour import contour_of_mask, outward_normals
 VIEW = np.array([0.0, 1.0, 0.0])  # the cameras look along +Y, at the front of the person
 
 
-def front_rig() -> Rig:
-    """Three cameras in a row, 0.4 m apart, 2.2 m before the origin."""
+def front_rig(focal_px: float = 1500.0) -> Rig:
+    """Three cameras in a row, 0.4 m apart, 2.2 m before the origin. With 800 px they show a whole person."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     cameras = [
         Camera(
             name=name,
             size_px=(1000, 800),
-            matrix=np.array([[1500, 0, 500], [0, 1500, 400], [0, 0, 1.0]]),
+            matrix=np.array([[focal_px, 0, 500], [0, focal_px, 400], [0, 0, 1.0]]),
             R_cam_world=R,
             t_cam_world_m=-R @ np.array([x, -2.2, 0.0]),
         )

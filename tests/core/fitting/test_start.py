@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core.body.model_file import read_model
+from tricap.core.body.model_file import read_model, smallest_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.inputs.fit_input import FitInput
@@ -24,7 +24,7 @@ from tricap.core.fitting.start.refine import EXCHANGES, Explanation, explanation
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run.joints import pixels_of, write_joints_as_clicks
-from tricap.core.take.take import read_take
+from tricap.core.take.take import AUTO_BODY, read_take
 from tricap.core.take.writing import read_table
 
 from .limb_scene import front_rig, measured_cloud
@@ -33,7 +33,7 @@ MODEL = read_model("full")
 SHAPE = default_shape(MODEL)
 SKELETON, NAMES = SHAPE.skeleton, SHAPE.skeleton.joint_names
 RARE = ("fair1_dab", "fair1_zombie", "rokoko_jesse_dance", "02_06_bend_scoop_lift_arm", "11_01_kick_soccer_ball", "cgspeed_05_06_dance")
-SETTINGS = FitSettings()
+SETTINGS, WIDE_PX = FitSettings(), 800.0
 STANDING = {"shoulder.R flexion": 50, "elbow.R flexion": 70, "shoulder.L abduction": -20, "hip.R flexion": 25, "knee.R flexion": 35}
 
 
@@ -47,7 +47,7 @@ def _pose(heading_deg: float) -> np.ndarray:
 def _input(pose: np.ndarray, points: int = 900, **changes) -> FitInput:
     rng = np.random.default_rng(0)
     cloud = measured_cloud(SHAPE, pose, 0, rng, points=points, noise=0.002, gross=0.01)
-    return FitInput(**{"rig": front_rig(), "model": "full", "clouds": [cloud], "time_s": np.zeros(1), **changes})
+    return FitInput(**{"rig": front_rig(WIDE_PX), "model": "full", "clouds": [cloud], "time_s": np.zeros(1), **changes})
 
 
 def _joints(pose: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicke
     assert _least_sure(list(lost.values()), 0.1, set()) in ("elbow.R", "wrist.R")
     assert _least_sure(list(lost.values()), 0.1, {"elbow.R", "wrist.R"}) is None and _least_sure(list(lost.values()), 1.0, set()) is None
     assert _with_limbs({"where the right arm is": 0.01}, list(lost.values()), 0.8)["where the right arm is"] > 0.4
-    clicks = {0: {"wrist.R": {c.name: c.project(joints["wrist.R"]) for c in front_rig().cameras}}}
+    clicks = {0: {"wrist.R": {c.name: c.project(joints["wrist.R"]) for c in front_rig(WIDE_PX).cameras}}}
     assert _limbs(replace(bare, clicks=clicks), pose, monkeypatch)["elbow.R"].certainty > 0.7
 
 
@@ -131,18 +131,81 @@ def test_a_search_can_be_cancelled() -> None:
         find_joints(_input(_pose(0.0)), SETTINGS, monitor)
 
 
-def test_a_person_cut_by_the_image_is_not_looked_for() -> None:
-    def seen(low: tuple[float, float], high: tuple[float, float]) -> SimpleNamespace:
-        camera, distance = SimpleNamespace(size_px=(640, 480)), SimpleNamespace(step_px=4)
-        return SimpleNamespace(cells=[SimpleNamespace(xy_px=np.array([low, high]), camera=camera, distance=distance)])
+def test_what_the_image_shows_of_the_person() -> None:
+    camera = SimpleNamespace(name="C", size_px=(640, 480), focal_px=480.0, to_camera=lambda X: X, project=lambda X: X[:, :2])
+    X = np.array([[300.0, 200.0, 1.5]])
 
-    assert search.is_inside(seen((100, 50), (300, 400))) and not search.is_inside(seen((100, 50), (300, 477)))
-    assert not any(search.is_inside(seen(*at)) for at in (((2, 50), (300, 400)), ((100, 2), (300, 400)), ((100, 50), (637, 400))))
+    def shown(low: tuple[float, float], high: tuple[float, float]) -> search.Framing:
+        cells = SimpleNamespace(xy_px=np.array([low, high]), camera=camera, distance=SimpleNamespace(step_px=4))
+        return search.framing(SimpleNamespace(cells=[cells], points=SimpleNamespace(xyz_m=X)), camera)
+
+    assert shown((100, 50), (300, 400)) is search.Framing.WHOLE and shown((100, 50), (300, 477)) is search.Framing.UPPER
+    cut = [((2, 50), (300, 400)), ((100, 2), (300, 477)), ((100, 50), (637, 477)), ((100, 300), (300, 400))]  # the last one is too small
+    assert {shown(*at) for at in cut} == {search.Framing.CUT}
+
+    def of_points(first: float, last: float) -> search.Framing:
+        rows = np.linspace(first, last, 100)
+        X = np.stack([np.full(100, 300.0), rows, np.full(100, 1.5)], axis=1)
+        return search.framing(SimpleNamespace(cells=[], points=SimpleNamespace(xyz_m=X)), camera)
+
+    assert [of_points(60, 420), of_points(60, 478), of_points(2, 300), of_points(300, 340)] == [
+        search.Framing.WHOLE, search.Framing.UPPER, search.Framing.CUT, search.Framing.CUT,
+    ]  # fmt: skip
+
+
+def _cut(model: str = AUTO_BODY) -> tuple[FitInput, np.ndarray]:
+    """A person of whom the image shows the head, the arms and the trunk, and the pose."""
+    pose, rig = _pose(20.0), front_rig(1500.0)
+    pose[SKELETON.layout.group("base")] = 0.0, 0.0, -0.45
+    cloud = measured_cloud(SHAPE, pose, 0, np.random.default_rng(0), points=4000, noise=0.002, gross=0.01)
+    seen = np.all([camera.sees(camera.project(cloud.xyz_m)) for camera in rig.cameras], axis=0)
+    inside = SimpleNamespace(**{key: value if key == "frame" else value[seen] for key, value in vars(cloud).items()})
+    return FitInput(rig=rig, model=model, clouds=[inside], time_s=np.zeros(1)), pose
+
+
+def test_an_upper_body_is_found_where_the_image_cuts_the_person(quick, monkeypatch) -> None:
+    given, pose = _cut()
+    found = find_joints(given, SETTINGS, Monitor(), RARE)
+    assert found is not None and found.model == "upper_body" and "hip.R" not in found.xyz_m
+    truth = dict(zip(NAMES, _joints(pose)))
+    off = {name: np.linalg.norm(found.xyz_m[name] - truth[name]) for name in ("shoulder.R", "shoulder.L", "neck")}
+    assert max(off.values()) < 0.12, off
+    assert find_joints(replace(given, model="full"), SETTINGS, Monitor()) is None  # a whole body is not begun by a part of it
+    monkeypatch.setattr(set_up, "find_joints", lambda *_: replace(found, probability=0.99))
+    limits = {"elbow.R flexion": (0.0, 2.0), "knee.R flexion": (0.0, 2.0)}
+    started = with_start(replace(given, limits=limits, locked=("hip.L flexion",)), SETTINGS, Monitor())
+    assert started.model == "upper_body" and [*started.limits] == ["elbow.R flexion"] and not started.locked
+    assert with_start(replace(given, model="arm.R"), SETTINGS, Monitor()).model == "arm.R"
+
+
+def test_without_a_model_clicks_on_a_limb_choose_it(monkeypatch) -> None:
+    given, joints = _input(_pose(0.0), model=AUTO_BODY), dict(zip(NAMES, _joints(_pose(0.0))))
+    monkeypatch.setattr(set_up, "find_joints", lambda *_: None)
+    start = StartJoints(frame=0, xyz_m=joints, stature=1.0, model="full", probability=0.1, rivals={"front and back": 0.9}, ask="elbow.R")
+    with monkeypatch.context() as improbable, pytest.raises(NobodyFound, match="may be no person that is seen. It is not certain how"):
+        improbable.setattr(set_up, "find_joints", lambda *_: start)
+        with_start(given, SETTINGS, Monitor())
+    with pytest.raises(
+        NobodyFound, match="or cut by nothing but its lower border. Click at least three.*or choose the limb that is filmed"
+    ):
+        with_start(given, SETTINGS, Monitor())
+    for model, names in (
+        ("arm.R", ("shoulder.R", "elbow.R", "wrist.R")),
+        ("leg.L", ("hip.L", "knee.L")),
+        ("upper_body", ("neck", "wrist.L")),
+    ):
+        clicks = {0: {name: {c.name: c.project(joints[name]) for c in front_rig(WIDE_PX).cameras} for name in names}}
+        assert smallest_model({*names}) == model
+        if model != "upper_body":
+            assert with_start(replace(given, clicks=clicks), SETTINGS, Monitor()).model == model
+    trunk = ("hip.R", "hip.L", "neck")
+    clicks = {0: {name: {c.name: c.project(joints[name]) for c in front_rig(WIDE_PX).cameras} for name in trunk}}
+    assert with_start(replace(given, clicks=clicks), SETTINGS, Monitor()).model == "full"
 
 
 def test_a_start_is_needed_without_three_joints_of_the_trunk() -> None:
     given, at = _input(_pose(0.0)), dict(zip(NAMES, _joints(_pose(0.0))))
-    clicks = {name: {c.name: c.project(xyz) for c in front_rig().cameras} for name, xyz in at.items()}
+    clicks = {name: {c.name: c.project(xyz) for c in front_rig(WIDE_PX).cameras} for name, xyz in at.items()}
 
     def clicked(*names: str) -> FitInput:
         return replace(given, clicks={0: {name: clicks[name] for name in names}})
@@ -177,7 +240,8 @@ def test_a_motion_that_a_rival_explains_better_takes_its_start_back(monkeypatch)
     monkeypatch.setattr(taken_back, "adjusted", lambda _fit, _points, found, *_: found)
     gain = dict.fromkeys(EXCHANGES.values(), -50.0)
     monkeypatch.setattr(taken_back, "exchanged", lambda _fit, _p, found, parts, *_, **__: replace(found, score=found.score + gain[parts]))
-    judge = partial(taken_back.taken_back, None, start, points, np.zeros((9, 1)), np.zeros(1), Monitor())
+    fit = SimpleNamespace(model=MODEL)
+    judge = partial(taken_back.taken_back, fit, start, points, np.zeros((9, 1)), np.zeros(1), Monitor())
     assert judge() is None
     gain[EXCHANGES["front and back"]] = 30.0
     assert judge() is None  # 90 voxels in three frames
@@ -188,7 +252,7 @@ def test_a_motion_that_a_rival_explains_better_takes_its_start_back(monkeypatch)
 def test_joints_that_are_left_to_other_frames_are_not_written_as_clicks() -> None:
     joints = dict(zip(NAMES, _joints(_pose(0.0))))
     start = StartJoints(frame=0, xyz_m=joints, stature=1.0, model="full", probability=0.99, rivals={}, ask="elbow.R", unsure=("wrist.R",))
-    footage = SimpleNamespace(rig=front_rig())
+    footage = SimpleNamespace(rig=front_rig(WIDE_PX))
     every, some = pixels_of(footage, replace(start, unsure=())), pixels_of(footage, start)
     assert set(every) - set(some) == {"wrist.R"} and "wrist.L" in some
 
@@ -252,7 +316,7 @@ def test_an_explanation_of_one_frame_alone_is_not_certain() -> None:
 
 def _clicked(joints: np.ndarray, name: str) -> SimpleNamespace:
     """A fit in which a joint is clicked, in all views of frame index 0."""
-    cameras = front_rig().cameras
+    cameras = front_rig(WIDE_PX).cameras
     row, xyz = NAMES.index(name), joints[NAMES.index(name)]
     xy = np.stack([camera.project(xyz[None])[0] for camera in cameras])
     return SimpleNamespace(clicked={0: SimpleNamespace(cameras=cameras, joint=np.full(len(cameras), row), xy_px=xy)})

@@ -31,7 +31,7 @@ def test_a_run_without_a_body(finished: Path) -> None:
     """Clouds, trajectories and a report; no body's files, and run.json and the page say why."""
     assert sorted(p.name for p in (finished / "clouds").iterdir()) == [f"{i:04d}.ply" for i in range(4)]
     run = json.loads((finished / "run.json").read_text())
-    assert run["stages"]["fit"]["not_done"] == "no [body] model" and any("No body was fitted" in w for w in run["warnings"])
+    assert run["stages"]["fit"]["not_done"] == "no clicked joints" and any("No body was fitted" in w for w in run["warnings"])
     assert {"measure", "track", "fit", "report"} <= set(run["stages"]) and run["stages"]["measure"]["residual_px"] < 0.3
     assert (finished / "trajectories.npz").exists()
     assert sorted(p.name for p in (finished / "tracked").iterdir()) == [f"{i:04d}.ply" for i in range(4)]

@@ -128,7 +128,7 @@ def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
 def test_every_part_of_a_take_concerns_a_stage() -> None:
     """A new field of Take must enter a key in stages.py, too: then add it here, and a case above."""
     measure = {"views", "rig_path", "interlaced", "first_field", "reference_view", "frames", "clicks", "corrections"}
-    fit = {"body_model", "no_body", "locked", "limits", "keyframes", "keypoints"}
+    fit = {"body_model", "locked", "limits", "keyframes", "keypoints"}
     assert {field.name for field in fields(Take)} == measure | fit | {"fps", "folder", "settings", "reference_chosen"}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.take.footage import open_take
-from tricap.core.take.take import Take, read_take
+from tricap.core.take.take import AUTO_BODY, Take, read_take
 
 HEAD = dict(format='"tricap-take"', version="1", fps="25.0", rig='"rig.toml"')
 CORNER = "[1, 2], "
@@ -92,9 +92,9 @@ def test_corrections_and_keyframes(tmp_path: Path) -> None:
 
 def test_no_body_and_a_body_of_ones_own(tmp_path: Path) -> None:
     none = read(tmp_path, text(more='[body]\nmodel = "none"\n'))
-    assert none.body_model is None and none.no_body and not read(tmp_path, text()).no_body
+    assert none.body_model is None and read(tmp_path, text()).body_model == AUTO_BODY and read(tmp_path, text()).joints_model == "full"
     own = read(tmp_path, text(more='[body]\nmodel = "my arm é.toml"\n'))
-    assert own.body_model == str(own.folder / "my arm é.toml") and not own.no_body
+    assert own.body_model == str(own.folder / "my arm é.toml") and own.joints_model == own.body_model
     for outside in ("../arm.toml", str(tmp_path / "arm.toml")):
         with pytest.raises(InputError, match="a file inside the take's folder"):
             read(tmp_path, text(more=f"[body]\nmodel = '{outside}'\n"))
@@ -102,7 +102,7 @@ def test_no_body_and_a_body_of_ones_own(tmp_path: Path) -> None:
 
 def test_what_may_be_left_out(tmp_path: Path) -> None:
     take = read(tmp_path, text(dict(rig=None)))
-    assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, None)
+    assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, AUTO_BODY)
     assert take.rig_path.name == "rig.toml" and not take.clicks.joints and not take.clicks.surface
     two = read(tmp_path, text(views=VIEWS.split('[[views]]\nname = "R"')[0]))
     assert two.reference_view == "C"
