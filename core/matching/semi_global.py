@@ -26,6 +26,7 @@ from ..images.interlace import RowGrid
 
 PIXEL_M = 0.0036  # at the person, of the rectified images: finer ones are reduced
 LEAST_REDUCTION = 1.3  # of images; less is not worth the loss
+FAR_PX = 1e4  # outside every image
 SPACING = 4  # pixels, of the points: as far apart as measured ones
 DEPTH_MARGIN_M, SIDE_MARGIN_M = 0.3, 0.25  # beyond the measured points, by which a limb may exceed them
 PERCENT = (1.0, 99.0)  # of the points' coordinates, that limit the region
@@ -144,8 +145,8 @@ class _Picture:
 
     def seen_along(self, rays: np.ndarray) -> np.ndarray:
         """The grey values (h, w) uint8 along rays (h, w, 3) in the world."""
-        at = self.rows.from_frame(self.camera.project(self.camera.centre_m + rays)).astype(np.float32)
-        return np.asarray(cv2.remap(self.image, np.nan_to_num(at, nan=-1e4), None, cv2.INTER_LINEAR))
+        at = np.nan_to_num(self.rows.from_frame(self.camera.project(self.camera.centre_m + rays)), nan=-FAR_PX).clip(-FAR_PX, FAR_PX)
+        return np.asarray(cv2.remap(self.image, at.astype(np.float32), None, cv2.INTER_LINEAR))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
