@@ -66,7 +66,7 @@ UNLIKELY = 0.01  # a less probable rival is not named
 JUDGED = ("shoulder", "hip", "knee", "ankle")  # joints by which explanations are compared: of an arm all frames decide
 ASKED = (*JUDGED, "elbow", "wrist")  # joints that a person can click
 ARMS = ("elbow.L", "elbow.R")  # the first joints of limbs that all frames decide, not the first one
-LEAST_CERTAINTY = 0.9  # of an arm: below it is not certain in its frame
+LEAST_CERTAINTY = 0.95  # of an arm: below it is not certain in its frame
 ELSEWHERE = 0.5  # of a leg: one that is less certain in all frames is more probably elsewhere
 MISSED_M = 0.07  # from a click to its joint: the probability of the start falls by e^(-½) at this distance
 
