@@ -11,6 +11,7 @@ class Cause(StrEnum):
 
     BLANK_VIEW = "blank view"
     CLICKS = "clicks"
+    CLOTHES = "clothes"
     COMBING = "combing"
     COVERAGE = "coverage"
     DARK = "dark"

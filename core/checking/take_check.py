@@ -1,19 +1,11 @@
 """`tricap check TAKE`: the footage, its timing, its texture, and whether the rig belongs to it.
 
-Clicks that are missing, contradict each other, or lie on the room instead of the person.
-
-Limbs with too little texture to be measured: the best sigma that matching could reach, before anything is matched.
-
-    S = Σ ∇f ∇fᵀ − n σ_∇² I ,   σ_px = √2 σ_noise / √λ_min(S)                     (1)
-
-over the pixels of a patch: the Cramér–Rao bound of a shift between two equally noisy images, less the gradients of the noise itself.
+Clicks that are missing, contradict each other, or lie on the room instead of the person. What the clothes allow is in `texture`.
 """
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..body.model_file import read_model
@@ -23,7 +15,6 @@ from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..geometry.robust import finite_median
 from ..images.combing import Combing, combing
-from ..images.sampling import noise_sigma
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
@@ -44,6 +35,7 @@ from .rig_check import (
     wide_findings,
 )
 from .survey import frozen_view, gap_findings, picture_findings, rate_findings, survey
+from .texture import Clothes
 from .timing import Film, TimeOffset, estimate_offsets
 from .view_matches import eight_bits, match_views
 
@@ -116,96 +108,6 @@ def _static_seeds(footage: Footage) -> list[int]:
     return [i for i, same in zip(clicked, unchanged(here, later, xy)) if same]
 
 
-GRADIENT_NOISE = 0.5  # variance of a central difference of noise of variance 1
-LEAST_NOISE = 0.3  # grey values: rounding alone
-POOR_SHARE = 0.5  # of the positions along a limb
-ALONG = (0.15, 0.85)  # part of a limb, from joint to joint
-SAMPLES = 24  # positions along a limb
-MOVES = 3.0  # times the noise: a pixel that changes by more is moving
-BLUR_PX = 9  # side of the window in which changes are averaged
-FEWEST_MOVING = 50  # pixels
-MOST_MOVING = 5000  # pixels that are evaluated, about
-TEXTURED_SHARE = 1e-3  # of an image without texture, at most
-
-
-def bound_px(grey: np.ndarray, patch_px: int, row_step: int) -> np.ndarray:
-    """Smallest sigma [px] (h, w) of a match at each pixel of the measured rows; inf where there is only noise.  (1)"""
-    noise = max(noise_sigma(grey), LEAST_NOISE)
-    gx = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5, 0.0, 0.5]], np.float32))
-    gy = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5], [0.0], [0.5]], np.float32))
-    size = (patch_px, max(3, patch_px // row_step))
-    n = size[0] * size[1]
-    xx, yy, xy = (n * cv2.blur(a * b, size).astype(np.float64) for a, b in ((gx, gx), (gy, gy), (gx, gy)))
-    smallest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy) - n * GRADIENT_NOISE * noise**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(smallest > 0, np.sqrt(2.0) * noise / np.sqrt(np.maximum(smallest, 1e-12)), np.inf)
-
-
-def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tuple[list[Finding], dict[str, float]]:
-    """Limbs between clicked joints, or moving parts, with too little texture in the reference view; and the median bound [px] of each."""
-    take, ref = footage.take, footage.take.reference
-    frame = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
-    grey = take.rows_at(frame).rows(footage.read(frame)[ref])
-    bound = bound_px(grey, patch_px, take.rows_at(frame).step)
-    view = take.views[ref].name
-    if not np.isfinite(bound).any() or np.mean(bound < max_sigma_px) < TEXTURED_SHARE:
-        return [
-            wrong(
-                Cause.NO_TEXTURE,
-                f"View {view} has no texture in frame {frame}: nothing in it can be matched.",
-                "Wear clothes with a fine pattern, and focus the cameras on the person.",
-                frame=frame,
-            )
-        ], {}
-    parts = _limbs(footage, view) or _moving(footage, grey, frame)
-    medians = {name: _median_at(bound, xy) for name, xy in parts.items()}
-    findings = [
-        doubtful(
-            Cause.WEAK_TEXTURE,
-            f"The texture of {name} is too poor in view {view}: "
-            + (f"a match there has a sigma of {value:.2g} px at best" if np.isfinite(value) else "it is lost in the noise")
-            + f" ({max_sigma_px:g} px is allowed).",
-            "Wear a pattern there, or use more light; or try --set matching.patch_px=21.",
-            bound_px=value if np.isfinite(value) else None,
-            limit_px=max_sigma_px,
-        )
-        for name, value in medians.items()
-        if value > max_sigma_px
-    ]
-    return findings, {name: value for name, value in medians.items() if np.isfinite(value)}
-
-
-def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
-    """Pixels (n, 2) of the measured rows along each bone whose two joints are clicked in the reference view."""
-    take = footage.take
-    if take.joints_model is None:
-        return {}
-    clicked = {name: at[view] for name, at in take.clicks.joints.items() if view in at}
-    t = np.linspace(*ALONG, SAMPLES)[:, None]
-    bones = read_model(take.joints_model).skeleton.bones
-    return {
-        b.name: take.rows_at(take.clicks.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
-        for b in bones
-        if b.head_joint in clicked and b.tail_joint in clicked
-    }
-
-
-def _moving(footage: Footage, grey: np.ndarray, frame: int) -> Mapping[str, np.ndarray]:
-    """Pixels (n, 2) of the parts that move until the frame furthest in time."""
-    other = max(footage.frames, key=lambda f: abs(f - frame))
-    later = footage.take.rows_at(other).rows(footage.read(other)[footage.take.reference])
-    difference = cv2.blur(np.abs((grey - np.median(grey)) - (later - np.median(later))), (BLUR_PX, BLUR_PX))
-    y, x = np.nonzero(difference > MOVES * max(1.0, noise_sigma(grey)))
-    return {"what moves": np.stack([x, y], axis=1)[:: max(1, len(x) // MOST_MOVING)]} if len(x) > FEWEST_MOVING else {}
-
-
-def _median_at(bound: np.ndarray, xy: np.ndarray) -> float:
-    inside = (xy >= 0).all(axis=1) & (xy <= np.array(bound.shape[::-1]) - 1).all(axis=1)
-    at = np.rint(xy[inside]).astype(int)
-    values = bound[at[:, 1], at[:, 0]]
-    return float(np.quantile(values, POOR_SHARE, method="higher")) if len(values) else 0.0
-
-
 DOUBTFUL_RESIDUAL_PX = 1.0  # median distance between the rays of matched points
 FROZEN_FRAMES = 3  # that are compared
 FEWEST_BESIDE = 4  # frames on either side of a step
@@ -261,7 +163,8 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     ]
     pairs = film.matches()
     identical = same_views(pairs, names)
-    weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
+    clothes = Clothes.of(footage, matching.patch_px)
+    weak = clothes.findings(matching.max_sigma_px)
     findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
     combed = film_combing(film) if footage.take.interlaced == "none" else None
     findings += [*combing_findings(combed), *weak, *seed_findings(footage)]
@@ -269,7 +172,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},
         "agreeing_share": round(agreeing_share(pairs, footage.rig.cameras), 4),
-        "texture_bound_px": bounds,
+        **clothes.figures(),
     }
     if not any(f.cause in UNUSABLE for f in findings):
         offsets = estimate_offsets(footage, monitor, film)

@@ -439,5 +439,5 @@ def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path
     files = pictures(take, "R")
     shutil.copy(files[2], files[3])
     checked = check_take(take, Monitor())
-    assert not checked.findings and len(checked.notes) == 1 and "View R repeats the frame before in frame 3" in checked.lines()[1]
+    assert not checked.findings and len(checked.notes) == 2 and "View R repeats the frame before in frame 3" in checked.lines()[1]
     assert checked.to_table()["good"] and checked.to_table()["notes"] == list(checked.notes)
