@@ -304,7 +304,7 @@ def _figures(step: str, entry: Mapping[str, Any]) -> str:
         return f"{entry['trajectories']} trajectories, {entry['mean_length_frames']:.0f} frames long on average."
     text = f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
     if "chosen_model" in entry:
-        text += f" The body is “{entry['chosen_model']}”, chosen by what is seen."
+        text += f" The body is “{entry['chosen_model']}”, chosen automatically."
     for word in (GUESSED, INFERRED):
         limbs = {limb: n for limb, counts in entry.get("limbs", {}).items() if (n := counts.get(word, 0))}
         listed = ", ".join(f"{limb} in {n:.0f} {'frame' if n == 1 else 'frames'}" for limb, n in limbs.items())

@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 
+from ...foundation.threads import THREADS
 from .closed_skin import OneSkin
 from .ends import HEAD
 from .surface_operators import factorised, laplacian, vertex_normals
@@ -113,7 +114,7 @@ def _nearest(points: np.ndarray, to: np.ndarray) -> np.ndarray:
     """The rows (M,) of the nearest of points (N, K) `to` others (M, K), any row where none is near enough."""
     from scipy.spatial import cKDTree
 
-    return np.minimum(cKDTree(points).query(to, distance_upper_bound=FARTHEST_M)[1], len(points) - 1)
+    return np.minimum(cKDTree(points).query(to, distance_upper_bound=FARTHEST_M, workers=THREADS)[1], len(points) - 1)
 
 
 def _continued(texels: Texels, rows: np.ndarray, values: np.ndarray, far: np.ndarray, fading_m: float = np.inf) -> np.ndarray:

@@ -137,7 +137,7 @@ class BackgroundDistances:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FitInput:
-    """A recording: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number."""
+    """A recording: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number; `model`: see `Take.body_model`."""
 
     rig: Rig
     model: str
