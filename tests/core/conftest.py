@@ -173,12 +173,14 @@ def scenes() -> Scenes:
 
 @pytest.fixture(scope="session")
 def plane_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four frames of a tilted plane that moves by 7 mm and turns by 1.5° a frame, to be measured coarsely; do not change it, copy it."""
+    """Four frames of a tilted plane that moves by 7 mm and turns by 1.5° a frame, to be measured coarsely, without a body; do not change
+    it, copy it."""
     from tricap.core.geometry.rotation import rotation_from_vector
 
     plane = Body(half_m=(0.26, 0.2), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
     frames = [[plane.moved(rotation_from_vector(np.array([0.0, 0.0, 0.026 * i])), [0.007 * i, -0.003 * i, 0.0])] for i in range(4)]
-    return write_take(tmp_path_factory.mktemp("plane"), three_cameras(), frames, more="[settings.growing]\nspacing_px = 6\n")
+    more = '[body]\nmodel = "none"\n[settings.growing]\nspacing_px = 6\n'
+    return write_take(tmp_path_factory.mktemp("plane"), three_cameras(), frames, more=more)
 
 
 @pytest.fixture(scope="session")
