@@ -35,6 +35,12 @@ def more(take: Path, text: str) -> None:
         file.write(text)
 
 
+def arm(take: Path, text: str) -> None:
+    """Add an arm's [body] with clicks, which is `text`, in place of none."""
+    before = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(before.replace('[body]\nmodel = "none"\n', "") + text)
+
+
 def masks(take: Path, count: int = 4, grey: int = 255) -> None:
     for i in range(count):
         png(take / "M" / f"{i}.png", grey)
@@ -98,8 +104,8 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no mask": (lambda take: view(take, 'mask = "m.png"'), "Cannot read the image"),
     "no background": (lambda take: view(take, 'background = "m.png"'), "Cannot read the image"),
     "another room": (another_room, "looks nothing like view L"),
-    "no keypoints": (lambda take: more(take, CLICKS + '[[keypoints]]\nfiles = "k.trc"\n'), "There are no keypoints"),
-    "unknown angle": (lambda take: more(take, CLICKS.replace("[seeds", 'locked = ["tail wag"]\n[seeds')), "tail wag"),
+    "no keypoints": (lambda take: arm(take, CLICKS + '[[keypoints]]\nfiles = "k.trc"\n'), "There are no keypoints"),
+    "unknown angle": (lambda take: arm(take, CLICKS.replace("[seeds", 'locked = ["tail wag"]\n[seeds')), "tail wag"),
 }
 if os.name != "nt":
     FAULTS |= {
