@@ -21,7 +21,7 @@ from ..core.foundation.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.interlace import BOTH, FieldLayout, field_layout
 from ..core.take.sources import PERSON_SOURCES
-from ..core.take.take import AUTO_BODY, NO_BODY, TOP_LEVEL, WHOLE_BODY, Take
+from ..core.take.take import AUTO_BODY, NO_BODY, TOP_LEVEL, Take, model_of_joints
 from ..core.take.take import body_model as take_body_model
 from ..core.take.writing import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import clicks, folders, properties
@@ -327,8 +327,7 @@ def joints_model(scene: bpy.types.Scene) -> str | None:
     Raises:
         InputError: the file is not in the project's folder.
     """
-    name = take_body_model(folder_of(scene), model_of(scene), "the panel")
-    return WHOLE_BODY if name == AUTO_BODY else name
+    return model_of_joints(take_body_model(folder_of(scene), model_of(scene), "the panel"))
 
 
 def _show_model(scene: bpy.types.Scene, name: str) -> None:

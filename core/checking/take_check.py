@@ -163,11 +163,10 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     ]
     pairs = film.matches()
     identical = same_views(pairs, names)
-    clothes = Clothes.of(footage, matching.patch_px)
-    weak = clothes.findings(matching.max_sigma_px)
+    clothes = Clothes.of(footage, matching)
     findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
     combed = film_combing(film) if footage.take.interlaced == "none" else None
-    findings += [*combing_findings(combed), *weak, *seed_findings(footage)]
+    findings += [*combing_findings(combed), *clothes.findings(), *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},

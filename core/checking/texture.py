@@ -24,6 +24,7 @@ from ..body.model_file import read_model
 from ..foundation.errors import InputError
 from ..geometry.intersection import intersect_clicks
 from ..images.sampling import noise_sigma
+from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage
 from .findings import Cause, Finding, doubtful, remark, wrong
@@ -38,17 +39,14 @@ MOVES = 3.0  # times the noise: a pixel that changes by more is moving
 BLUR_PX = 9  # side of the window in which changes are averaged
 FEWEST_MOVING = 50  # pixels
 MOST_MOVING = 5000  # pixels that are evaluated, about
-MOST_BOUND_PX, TEXTURED_SHARE = 0.25, 1e-3  # at most so much of an image without texture has a bound below this
+TEXTURED_SHARE = 1e-3  # of an image without texture, at most
 PATCH_PX = 0.045  # σ_0 of (2)
 MEDIAN = 0.6745  # of the size of an error, over its sigma
-PLAIN_PX, PLAIN_MM = (
-    0.07,
-    1.2,
-)  # a bound, and the median error that follows, from where on the surface has holes, and few points are tracked
+PLAIN_PX, PLAIN_MM = 0.07, 1.2  # the bound and the median error of plain clothes, on which the surface has holes, are larger
 PATTERN_PX = 0.03  # the bound of printed cloth
 CLOSER = 2 / 3  # of the distance, that is advised
 AGREES_PX = 3.0  # between the rays of two matches
-FEWEST_MATCHES = 5  # for a distance
+FEWEST_DEPTHS = 5  # of matches, for a distance
 EVERYTHING = "what moves"
 PARTS = {"upper_arm": "arm", "forearm": "arm", "hand": "arm", "thigh": "leg", "shin": "leg", "foot": "leg"}
 SIDES = {"R": "right", "L": "left"}
@@ -62,10 +60,11 @@ class Clothes:
     frame: int
     bound_px: Mapping[str, float]  # the median of each bone between clicked joints, or of what moves; inf where it is lost in the noise
     mm_per_px: float  # of (2), in depth; NaN where the distance of the person is not known
+    max_sigma_px: float  # of a match, that is allowed
     is_blank: bool = False  # there is no texture anywhere
 
     @staticmethod
-    def of(footage: Footage, patch_px: int) -> "Clothes":
+    def of(footage: Footage, matching: MatchingSettings) -> "Clothes":
         """Those of an opened take.
 
         Raises:
@@ -74,38 +73,36 @@ class Clothes:
         take, ref = footage.take, footage.take.reference
         frame = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
         images = [take.rows_at(frame).rows(image) for image in footage.read(frame)]
-        bound = bound_px(images[ref], patch_px, take.rows_at(frame).step)
-        blank = not np.isfinite(bound).any() or bool(np.mean(bound < MOST_BOUND_PX) < TEXTURED_SHARE)
+        bound = bound_px(images[ref], matching.patch_px, take.rows_at(frame).step)
+        blank = not np.isfinite(bound).any() or bool(np.mean(bound < matching.max_sigma_px) < TEXTURED_SHARE)
         parts = {} if blank else _limbs(footage, take.views[ref].name) or _moving(footage, images[ref], frame)
         return Clothes(
             view=take.views[ref].name,
             frame=frame,
             bound_px={name: _median_at(bound, xy) for name, xy in parts.items()},
             mm_per_px=_mm_per_px(footage, _distance_m(footage, images, frame, parts)),
+            max_sigma_px=matching.max_sigma_px,
             is_blank=blank,
         )
 
-    def findings(self, max_sigma_px: float) -> list[Finding]:
-        """Parts with too little texture, by the largest sigma of a match that is allowed, and a remark on the precision to expect."""
+    def findings(self) -> list[Finding]:
+        """Parts with too little texture, and a remark on the precision to expect."""
         if self.is_blank:
             sentence = f"View {self.view} has no texture in frame {self.frame}: nothing in it can be matched."
-            return [
-                wrong(
-                    Cause.NO_TEXTURE, sentence, "Wear clothes with a fine pattern, and focus the cameras on the person.", frame=self.frame
-                )
-            ]
+            advice = "Wear clothes with a fine pattern, and focus the cameras on the person."
+            return [wrong(Cause.NO_TEXTURE, sentence, advice, frame=self.frame)]
         poor = [
             doubtful(
                 Cause.WEAK_TEXTURE,
                 f"The texture of {name} is too poor in view {self.view}: "
                 + (f"a match there has a sigma of {value:.2g} px at best" if np.isfinite(value) else "it is lost in the noise")
-                + f" ({max_sigma_px:g} px is allowed).",
+                + f" ({self.max_sigma_px:g} px is allowed).",
                 "Wear a pattern there, or use more light; or try --set matching.patch_px=21.",
                 bound_px=value if np.isfinite(value) else None,
-                limit_px=max_sigma_px,
+                limit_px=self.max_sigma_px,
             )
             for name, value in self.bound_px.items()
-            if value > max_sigma_px
+            if value > self.max_sigma_px
         ]
         return [*poor, *self._expected()]
 
@@ -225,7 +222,7 @@ def _distance_m(footage: Footage, images: list[np.ndarray], frame: int, parts: M
             depths.append(cameras[take.reference].to_camera(found.xyz_m)[:, 2])
     known = np.concatenate([np.zeros(0), *depths])
     known = known[np.isfinite(known)]
-    return float(np.median(known)) if len(known) >= FEWEST_MATCHES else float("nan")
+    return float(np.median(known)) if len(known) >= FEWEST_DEPTHS else float("nan")
 
 
 def _mm_per_px(footage: Footage, distance_m: float) -> float:

@@ -31,8 +31,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
-    if args.model and take.body_model and not args.model.endswith(".toml"):  # a user's own model may be copied into the folder later
-        read_model(args.model)
+    if take.joints_model and not take.joints_model.endswith(".toml"):  # a user's own model may be copied into the folder later
+        read_model(take.joints_model)
     rig = read_any(args.rig) if args.rig else None
     if rig:
         for view in take.views:

@@ -189,8 +189,8 @@ class Take:
 
     @property
     def joints_model(self) -> str | None:
-        """The model whose joints can be clicked: that of the whole person until one is chosen."""
-        return WHOLE_BODY if self.body_model == AUTO_BODY else self.body_model
+        """See `model_of_joints`."""
+        return model_of_joints(self.body_model)
 
     @property
     def reference(self) -> int:
@@ -389,6 +389,11 @@ def _settings(take: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, 
             raise InputError(f"{where} sets `{key}` twice, also under [settings.{group}]; remove one of them.")
         table[group] = {**values, key: take[key]}
     return table
+
+
+def model_of_joints(model: str | None) -> str | None:
+    """The model whose joints can be clicked: that of the whole person until one is chosen."""
+    return WHOLE_BODY if model == AUTO_BODY else model
 
 
 def body_model(folder: Path, name: str | None, where: str) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 from tricap.core.checking.texture import MEDIAN, PATCH_PX, Clothes, _mm_per_px, bound_px
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.sampling import noise_sigma
+from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.run.check import check_take
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import FrameClicks, read_take
@@ -26,15 +27,15 @@ def test_the_bound_of_waves_is_known() -> None:
     assert np.isinf(bound_px(np.full((60, 60), 99, np.float32), 13, 1)).all()
 
 
-def _said(clothes: Clothes, limit_px: float = 0.25) -> list[str]:
-    return [str(finding) for finding in clothes.findings(limit_px)]
+def _said(clothes: Clothes) -> list[str]:
+    return [str(finding) for finding in clothes.findings()]
 
 
 def test_printed_clothes_get_a_number_and_plain_ones_advice() -> None:
-    printed = Clothes(view="C", frame=0, bound_px=PRINTED, mm_per_px=25.0)
+    printed = Clothes(view="C", frame=0, bound_px=PRINTED, mm_per_px=25.0, max_sigma_px=0.25)
     assert _said(printed) == ["Note: By the texture, half of the measured points should be within 0.8 mm (left leg), "
                               "0.9 mm (right arm, trunk and head) of the surface."]  # fmt: skip
-    assert printed.findings(0.25)[0].harmless
+    assert printed.findings()[0].harmless
     plain = replace(printed, bound_px=PRINTED | {"thigh.L": 0.12, "shin.L": 0.3})
     weak, note = _said(plain)
     assert "The texture of shin.L is too poor in view C: a match there has a sigma of 0.3 px" in weak
@@ -52,7 +53,7 @@ def test_printed_clothes_get_a_number_and_plain_ones_advice() -> None:
 def test_the_distance_is_known_without_clicks(arm_recording: Callable[..., Path]) -> None:
     footage = open_take(read_take(arm_recording()))
     bare = replace(footage, take=replace(footage.take, clicks=FrameClicks()))
-    clicked, found = Clothes.of(footage, 13), Clothes.of(bare, 13)
+    clicked, found = Clothes.of(footage, MatchingSettings()), Clothes.of(bare, MatchingSettings())
     assert [*found.bound_px] == ["what moves"] and {*clicked.bound_px} == {"upper_arm.R", "forearm.R"}
     assert np.isclose(found.mm_per_px, clicked.mm_per_px, rtol=0.15)
     middle, outer = (
@@ -61,6 +62,12 @@ def test_the_distance_is_known_without_clicks(arm_recording: Callable[..., Path]
     )
     base = np.sqrt(sum(np.sum((c.centre_m - middle.centre_m) ** 2) for c in outer))
     assert np.isclose(_mm_per_px(footage, 2.0), 4e3 / (middle.focal_px * base), rtol=0.02)
+
+
+def test_what_counts_as_texture_follows_the_limit_of_matching(arm_recording: Callable[..., Path]) -> None:
+    footage = open_take(read_take(arm_recording()))
+    assert not Clothes.of(footage, MatchingSettings()).is_blank
+    assert Clothes.of(footage, MatchingSettings(max_sigma_px=0.01)).is_blank
 
 
 def test_check_says_what_to_expect(arm_recording: Callable[..., Path], tmp_path: Path) -> None:

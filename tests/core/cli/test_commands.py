@@ -319,6 +319,8 @@ def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capt
     views = [f"{name}={take / name}" for name in "LCR"]
     assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
     assert read_take(tmp_path / "new").body_model is None and "click" not in capfd.readouterr().out
+    assert main.main(["new", str(tmp_path / "auto"), "--views", *views, "--model", "auto"]) == 0
+    assert read_take(tmp_path / "auto").joints_model == "full"
 
 
 @pytest.mark.parametrize(
