@@ -162,8 +162,7 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
     for shown, model in PERSONS.items():
         if given.model == WHOLE_BODY != model:
             break  # a whole body is not begun by a part of it
-        part = given if given.model == model else replace(given, model=model, limits={}, locked=())
-        fit = replace(_without_start(part, settings, points_of), monitor=monitor)
+        fit = replace(_without_start(_of_model(given, model), settings, points_of), monitor=monitor)
         if (start := find_start(fit, points_of, given.frames, given.time_s, monitor, shown, without)) is not None:
             return start
     return None

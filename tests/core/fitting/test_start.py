@@ -117,6 +117,15 @@ def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicke
     assert _limbs(replace(bare, clicks=clicks), pose, monkeypatch)["elbow.R"].certainty > 0.7
 
 
+@pytest.mark.parametrize("model", [AUTO_BODY, "full", "arm.R"])
+def test_a_search_keeps_to_the_limits_of_the_take(model: str, monkeypatch) -> None:
+    limits, used = {"elbow.R flexion": (0.1, 2.0)}, {}
+    monkeypatch.setattr(set_up, "find_start", lambda fit, *_: used.setdefault("model", fit.model))
+    find_joints(_input(_pose(0.0), model=model, limits=limits), SETTINGS, Monitor())
+    dofs = {dof.name: dof.limits for dof in used["model"].skeleton.dofs}
+    assert used["model"].name == "full" and dofs["elbow.R flexion"] == limits["elbow.R flexion"] and dofs["elbow.L flexion"][0] == 0.0
+
+
 def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
     scene = make_scene(points=50)
     given = FitInput(rig=scene.rig, model="arm.R", clouds=scene.clouds, time_s=np.zeros(1))
