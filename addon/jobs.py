@@ -26,6 +26,7 @@ from ..core.fitting.inputs.start_joints import NeedsClick
 from ..core.foundation.errors import InputError, sentence_of
 from ..core.foundation.progress import Cancelled, Monitor, time_text
 from ..core.foundation.threads import one_thread_in_linear_algebra
+from .alone import WaitingMonitor
 from .panels import check_own, show_status
 from .session import get_session
 
@@ -46,7 +47,7 @@ class Job:
     def __init__(self, compute: Callable[[Monitor], Any], steps: Mapping[str, str] | None = None, first_step: str = "") -> None:
         self._compute, self._steps, self._first_step = compute, steps or {}, first_step
         self._thread: threading.Thread | None = None
-        self.monitor = Monitor(self._note)
+        self.monitor = WaitingMonitor(self._note)
         self.stage, self.done, self.total = "", 0.0, 0.0
         self._pace: deque[tuple[float, float]] = deque(maxlen=PACE_PARTS)  # time, and fraction of the current stage
         self._steps_left: Generator[None, None, Any] | None = None
@@ -85,10 +86,11 @@ class Job:
 
     def start(self) -> None:
         """Compute on a worker thread."""
-        self._thread = threading.Thread(target=self._run_in_thread, name="tricap job", daemon=True)
+        self._thread = self.monitor.job_thread = threading.Thread(target=self._run_in_thread, name="tricap job", daemon=True)
         self._thread.start()
 
     def _run_in_thread(self) -> None:
+        get_session().may_run.wait()
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:

@@ -6,6 +6,7 @@ state of its own. Every other module imports this one, so it imports none of the
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -50,12 +51,20 @@ class FileState:
     region_corners: tuple[str, list[tuple[float, float]]] = ("", [])  # the view, and the corners clicked so far
 
 
+def _set() -> Event:
+    event = Event()
+    event.set()
+    return event
+
+
 @dataclass(eq=False, kw_only=True)
 class Session:
     """What the add-on remembers."""
 
     file: FileState = field(default_factory=FileState)
     job: Any = None  # the jobs.Job that computes on the worker thread
+    may_run: Event = field(default_factory=_set)  # not set while an operator has to be alone (alone.py)
+    job_waits: Event = field(default_factory=Event)  # … and the job has noticed it
     job_operator: Any = None  # the modal operator that watches it (jobs.JobOperator)
     click_operator: Any = None  # the modal operator of the clicks (clicking.operators)
     click_drawing: Any = None  # clicking.draw.Drawing

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +84,10 @@ class Finder:
         if self._pending is not None and not self._pending.cancelled():
             self._pending.result()
         return self.poll()
+
+    def finish(self, seconds: float) -> None:
+        """Wait until nothing is computed, at most for some seconds."""
+        wait([self._pool.submit(int)], seconds)
 
     def close(self) -> None:
         """End the thread after its current computation (well below a second)."""

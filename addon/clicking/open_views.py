@@ -6,6 +6,7 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from .. import clicks, project
+from ..alone import override
 from ..overlay import canvas
 from ..scene import stored
 from ..session import get_session
@@ -162,7 +163,7 @@ def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, s
     if switches and not bpy.app.background:
         next(r for r in editors[-1].regions if r.type == "UI").active_panel_category = "Tricap"
     for area in canvas.clip_areas(window):
-        with bpy.context.temp_override(window=window, area=area, region=canvas.window_region(area)):
+        with override(window=window, area=area, region=canvas.window_region(area)):
             bpy.ops.clip.view_all(fit_view=True)
 
 
@@ -171,7 +172,7 @@ def _split(window: bpy.types.Window, area: bpy.types.Area, parts: int, direction
     area.type = "CLIP_EDITOR"
     before = set(window.screen.areas) - {area}
     for left in range(parts, 1, -1):  # the area itself is split each time: a new one has no size yet
-        with bpy.context.temp_override(window=window, area=area, region=canvas.window_region(area)):
+        with override(window=window, area=area, region=canvas.window_region(area)):
             bpy.ops.screen.area_split(direction=direction, factor=1 / left)
     return [a for a in window.screen.areas if a not in before]
 
@@ -190,7 +191,7 @@ def show_clip(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
 
 def close_others(window: bpy.types.Window) -> None:
     for area in [a for a in window.screen.areas if a.type in CLOSED]:
-        with bpy.context.temp_override(window=window, area=area):
+        with override(window=window, area=area):
             bpy.ops.screen.area_close()
 
 

@@ -8,6 +8,7 @@ from mathutils import Vector
 from ...core.foundation.errors import InputError
 from ...core.geometry.view_angles import default_reference
 from .. import project
+from ..alone import override
 from ..clicking.open_views import NO_WINDOW, REVIEW, close_others, go_to, lay_out_soon, show_clip
 from ..overlay import canvas
 from ..scene.standing import all_bodies
@@ -62,7 +63,7 @@ def lay_out(window: bpy.types.Window, clip_name: str) -> Iterator[str]:
         yield "others closed"
     largest, before = max(areas, key=lambda area: area.width * area.height), set(areas)
     largest.type = "VIEW_3D"
-    with bpy.context.temp_override(window=window, area=largest, region=canvas.window_region(largest)):
+    with override(window=window, area=largest, region=canvas.window_region(largest)):
         bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
     yield "split"
     (new,) = set(areas) - before
@@ -73,7 +74,7 @@ def lay_out(window: bpy.types.Window, clip_name: str) -> Iterator[str]:
     yield "shown"
     if not bpy.app.background:
         next(region for region in footage.regions if region.type == "UI").active_panel_category = "Tricap"
-    with bpy.context.temp_override(window=window, area=footage, region=canvas.window_region(footage)):
+    with override(window=window, area=footage, region=canvas.window_region(footage)):
         bpy.ops.clip.view_all(fit_view=True)
     for body in all_bodies(window.scene):
         frame(spatial.spaces.active.region_3d, body)

@@ -13,6 +13,7 @@ from mathutils import Matrix, Quaternion, Vector
 from ...core.body.fields import POTENTIALS
 from ...core.foundation.progress import Monitor
 from .. import folders
+from ..alone import override
 from ..jobs import JobOperator
 from ..scene import armature
 from ..scene.cloud import COLOURS
@@ -181,7 +182,7 @@ def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, thi
     thing.select_set(True)
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
         region = next(r for r in area.regions if r.type == "WINDOW")
-        with context.temp_override(area=area, region=region):
+        with override(area=area, region=region):
             if front:  # at once: the next operator would stop a view that is still turning
                 view = area.spaces.active.region_3d
                 view.view_rotation, view.view_perspective = FRONT, "ORTHO"

@@ -6,6 +6,8 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from ..alone import override
+
 DISTANCES = 2.4  # from which the body is seen, by its size
 
 
@@ -25,5 +27,5 @@ def show_all_frames(context: bpy.types.Context) -> None:
     if context.window is None or bpy.app.background:
         return
     for area in (a for a in context.window.screen.areas if a.type == "DOPESHEET_EDITOR"):
-        with context.temp_override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
+        with override(area=area, region=next(r for r in area.regions if r.type == "WINDOW")):
             bpy.ops.action.view_all()

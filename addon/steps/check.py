@@ -21,6 +21,7 @@ from ...core.geometry.rig import read_rig, renamed
 from ...core.images.interlace import BOTH
 from ...core.take.bar_file import read_bar
 from .. import project, properties
+from ..alone import override
 from ..jobs import JobOperator
 from ..session import get_session
 from . import states, watch
@@ -218,7 +219,7 @@ def _look() -> float:
     scene, window = context.scene, next(iter(context.window_manager.windows), None)
     if scene is not None and window is not None and not bpy.app.background and should_begin(scene):
         get_session().file.checked_keys.add(watch.current(scene).keys["measure"])
-        with context.temp_override(window=window):
+        with override(window=window):
             bpy.ops.tricap.check("INVOKE_DEFAULT")
     return LOOK_S
 

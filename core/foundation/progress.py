@@ -34,7 +34,7 @@ class Monitor:
         Raises:
             Cancelled: `cancel()` was called.
         """
-        if self._cancel.is_set():
+        if self.cancelled:
             raise Cancelled(f"Stopped during {stage}, {done:g} of {total:g} done.")
         if self.course is not None:
             self.course.step(stage, done, total)

@@ -46,6 +46,44 @@ def running(jobs: ModuleType) -> object:
     return job
 
 
+def test_an_operator_is_alone(jobs: ModuleType) -> None:
+    seen = [0]
+
+    def count(monitor: object) -> None:
+        while True:
+            monitor.check()
+            seen[0] += 1
+
+    module, session = importlib.import_module(f"{ADDON}.alone"), session_of(jobs)
+    session.job = jobs.Job(count)
+    finder = SimpleNamespace(finish=lambda seconds: seen.append(seen[0]))
+    session.finders.append(finder)
+    session.job.start()
+    wait_until(lambda: seen[0])
+    try:
+        with module.alone():
+            held = seen[0]
+            time.sleep(0.05)  # a thread that goes on counts some thousands
+            assert seen == [held, held], "the finder was asked, and the job stands still"
+            late = jobs.Job(lambda monitor: seen.append(-1))
+            late.start()
+            time.sleep(0.05)
+            assert seen == [held, held], "no job begins meanwhile"
+    finally:
+        session.finders.remove(finder)
+    wait_until(lambda: seen[-1] == -1 and seen[0] > held)
+
+
+def test_an_operator_does_not_wait_for_a_job_that_never_looks(jobs: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, session, end = importlib.import_module(f"{ADDON}.alone"), session_of(jobs), threading.Event()
+    session.job = jobs.Job(lambda monitor: end.wait(PATIENCE_S))
+    session.job.start()
+    monkeypatch.setattr(module, "LONGEST_S", 0.05)
+    with module.alone():
+        assert session.job.alive
+    end.set()
+
+
 def test_here_and_on_a_thread_give_the_same(jobs: ModuleType) -> None:
     def compute(monitor: object) -> tuple[int, bool]:
         monitor.step("adding", 1, 2)
