@@ -33,7 +33,7 @@ STAMP = "tricap-setup.txt"
 LONG_BENCHES = ("resume", "surface", "clip")  # run when they are named only
 # What an extension consists of; everything else in the repository is for developers.
 SHIPPED_FILES = ("blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE")
-SHIPPED_FOLDERS = {"core": (".py", ".toml", ".csv"), "addon": (".py", ".toml", ".json")}
+SHIPPED_FOLDERS = {"core": (".py", ".toml", ".csv"), "addon": (".py", ".toml", ".json", ".zip")}
 ANY = "any"  # the platform of a wheel in Python alone
 PLATFORM_OF_TAG = {"x86_64": "linux-x64", "amd64": "windows-x64", "arm64": "macos-arm64", ANY: ANY}  # how a wheel's name ends
 
@@ -218,6 +218,21 @@ def demo(out: str) -> int:
     return run(venv_program("python"), "-m", "tricap", "demo", "--out", Path(out).absolute())
 
 
+def sample() -> int:
+    """The archive that *Load Sample* opens, made anew; needed when a test says that it is out of date."""
+    made = """
+import pathlib, sys
+from tricap.core.run import pipeline
+from tricap.core.synthetic import sample
+archive, folder = map(pathlib.Path, sys.argv[1:])
+sample.make_recording(folder)
+pipeline.run(folder, folder / sample.RESULTS)
+sample.pack(archive, folder)
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        return run(venv_program("python"), "-P", "-c", made, ROOT / "addon" / "sample.zip", Path(folder) / "sample")
+
+
 def test(everything: bool, pytest_arguments: list[str]) -> int:
     """Lint, types and tests; without `--all` the slow tests are left out. A process per core, each file in one of them (`-n0`: in none).
 
@@ -387,6 +402,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("setup", help="make .venv for this Python and install what is needed (the other commands do it too)")
     part = commands.add_parser("demo", help="make a sample recording, run everything on it, say how close the result is")
     part.add_argument("--out", default=str(ROOT / "out" / "demo"), help="folder of the results (default: out/demo)")
+    commands.add_parser("sample", help="make addon/sample.zip anew, which Load Sample opens")
     part = commands.add_parser("test", allow_abbrev=False, help="lint, types and tests; further arguments go to pytest")
     part.add_argument("--all", action="store_true", help="the slow tests too")
     part = commands.add_parser("build", help="make the extension, one validated zip per platform")
@@ -415,6 +431,8 @@ def main() -> int:
     setup()
     if options.command == "demo":
         return demo(options.out)
+    if options.command == "sample":
+        return sample()
     if options.command == "test":
         return test(options.all, rest)
     if options.command == "build":

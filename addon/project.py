@@ -29,6 +29,7 @@ from .scene import clips
 from .session import get_session
 
 ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
+SAMPLE_NAME = "tricap_sample"  # the folder that Load Sample makes
 SAME_RATE = 1e-3  # relative difference of the images per second that does not show
 OTHER_FIELDS = "The footage does not show the chosen fields. Press Reload Footage."
 CHANGED_OUTSIDE = "take.toml was changed outside Blender. Reload Take uses these changes, Overwrite Take discards them."
@@ -37,6 +38,11 @@ CHANGED_OUTSIDE = "take.toml was changed outside Blender. Reload Take uses these
 def bound(scene: bpy.types.Scene) -> bool:
     """Whether the scene has footage, so that take.toml is written from the scene."""
     return len(scene.tricap.views) > 0
+
+
+def is_sample(scene: bpy.types.Scene) -> bool:
+    """Whether the scene's footage is that of the sample."""
+    return bool(scene.tricap.take) and folders.absolute(scene.tricap.take).name == SAMPLE_NAME
 
 
 def folder_of(scene: bpy.types.Scene) -> Path:

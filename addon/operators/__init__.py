@@ -7,6 +7,7 @@ from . import build_scene, control_rig, import_tracks, run, stages
 
 CLASSES = (
     run.LoadSample,
+    run.ComputeSample,
     stages.Measure,
     stages.Track,
     stages.Fit,

@@ -181,7 +181,9 @@ def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, thi
         item.select_set(False)
     thing.select_set(True)
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
-        region = next(r for r in area.regions if r.type == "WINDOW")
+        region, shading = next(r for r in area.regions if r.type == "WINDOW"), area.spaces.active.shading
+        if shading.color_type == "MATERIAL":  # Blender's own choice
+            shading.color_type = "TEXTURE"  # the person's clothes; where there is none, the material's colour
         with override(area=area, region=region):
             if front:  # at once: the next operator would stop a view that is still turning
                 view = area.spaces.active.region_3d

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import bpy
 
@@ -20,9 +19,8 @@ if TYPE_CHECKING:
     from ...core.run.take_run import Run as TakeRun
     from ..scene.contents import Contents
 
-SAMPLE_NAME = "tricap_sample"
 EXTENSION = __package__.rpartition(".addon")[0]
-SAMPLE = MappingProxyType({"frames": 12, "fps": 15.0, "width_px": 512, "interlaced": "none"})  # of core.synthetic.arm.ArmTakeSettings
+SAMPLE = Path(__file__).resolve().parent.parent / "sample.zip"
 
 
 class Run(StageOperator, bpy.types.Operator):
@@ -89,21 +87,19 @@ def measure(
     return run, read_contents(out, monitor) if build else None
 
 
-class LoadSample(JobOperator, bpy.types.Operator):
-    """Make a small synthetic recording of a moving arm, measure it, and build the scene. Takes about half a minute"""
+class SampleOperator(JobOperator):
+    """Mix-in: open the sample, computed `again` or as it is."""
 
-    bl_idname = "tricap.load_sample"
-    bl_label = "Load Sample and Run"
-    bl_options = {"UNDO"}
+    again: ClassVar[bool] = False
 
     def snapshot(self, context: bpy.types.Context) -> "Callable[[Monitor], tuple[Path, TakeRun, Contents | None]]":
         """The folder of the recording: next to the .blend, or in the extension's user folder if the file was never saved."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
-        take = base / SAMPLE_NAME
+        take = base / project.SAMPLE_NAME
         if project.bound(context.scene) and project.folder_of(context.scene) != real_path(take):
-            raise InputError("This file already has footage. Open an empty one (File > New > General) and press Load Sample and Run there.")
+            raise InputError("This file already has footage. Open an empty one (File > New > General) and press Load Sample there.")
         folders.check_writable(base)
-        return lambda monitor: make_sample(take, monitor)
+        return lambda monitor: open_sample(take, self.again, monitor)
 
     def finish(self, context: bpy.types.Context, result: "tuple[Path, TakeRun, Contents | None]") -> set[str]:
         """Open the sample as the scene's project, and build the scene."""
@@ -116,13 +112,48 @@ class LoadSample(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def make_sample(take: Path, monitor: Monitor) -> "tuple[Path, TakeRun, Contents | None]":
-    """The computation, without bpy. An existing sample is measured as it is, including changes."""
-    from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
+class LoadSample(SampleOperator, bpy.types.Operator):
+    """Open a finished project: a person who walks, filmed by three cameras, measured and fitted. The recording is synthetic"""
 
+    bl_idname = "tricap.load_sample"
+    bl_label = "Load Sample"
+    bl_options = {"UNDO"}
+
+
+class ComputeSample(SampleOperator, bpy.types.Operator):
+    """Measure the footage of the sample, track it, and fit the body, from the beginning. Takes about a minute"""
+
+    bl_idname = "tricap.compute_sample"
+    bl_label = "Compute It Again"
+    bl_options = {"UNDO"}
+    again = True
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only with the sample open."""
+        return project.is_sample(context.scene)
+
+
+def open_sample(take: Path, again: bool, monitor: Monitor) -> "tuple[Path, TakeRun, Contents | None]":
+    """The computation, without bpy. A sample that is there stays, with its changes; what is not valid of its results is computed, or all
+    of it `again`."""
+    from ...core.run.take_run import open_run
+    from ...core.synthetic.arm import is_arm_take
+    from ...core.synthetic.sample import unpack
+    from ..scene.contents import read_contents
+
+    out = take / project.RESULTS
     if not is_arm_take(take):
-        make_arm_take(take, ArmTakeSettings(**SAMPLE), monitor)
-    return take, *measure(take, take / project.RESULTS, {}, True, monitor)
+        unpack(SAMPLE, take)
+    with open_run(take, out) as run:
+        fitted = "fit" in run.record["stages"]
+    if fitted and not again:
+        monitor.begin("build")
+        return take, run, read_contents(out, monitor)
+    if fitted:
+        with open_run(take, out, restart=True) as run:
+            run.results.remove("run.json")
+    return take, *measure(take, out, {}, True, monitor)
 
 
 class Cancel(bpy.types.Operator):

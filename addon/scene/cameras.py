@@ -66,13 +66,13 @@ def frame_faults(rig: Rig, reference: Camera) -> list[str]:
 
 
 def look_through() -> None:
-    """Let every 3D Viewport look through the scene's camera and show the materials' colours."""
+    """Let every 3D Viewport look through the scene's camera and show the materials' textures and colours."""
     for screen in bpy.data.screens:
         for area in screen.areas:
             if area.type == "VIEW_3D":
                 space = area.spaces.active
                 space.region_3d.view_perspective = "CAMERA"
-                space.shading.color_type = "MATERIAL"
+                space.shading.color_type = "TEXTURE"  # where there is none, the material's colour
 
 
 def projected(scene: bpy.types.Scene, camera_object: bpy.types.Object, xyz_m: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:

@@ -3,6 +3,7 @@
 import bpy
 
 from ..panels import TricapPanel, sentence
+from ..project import is_sample
 from . import bodies, check, watch
 from .states import STEPS, TITLES, State, Status, is_rate_assumed
 
@@ -106,6 +107,8 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         box.prop(context.scene.tricap, "model", text="Body")
     if now.can_run:
         box.operator("tricap.run", icon="FF", text="Run Remaining Steps")
+    if is_sample(context.scene):
+        box.operator("tricap.compute_sample", icon="FILE_REFRESH")
 
 
 CLASSES = (TRICAP_UL_views, TRICAP_PT_main)

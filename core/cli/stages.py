@@ -15,7 +15,7 @@ from ..run.engine import Engine, of_this_machine
 from ..run.settings import settings_of
 from ..surface.resolution import measured_footage
 from ..surface.starts import MeasureSettings, first_seeds
-from ..synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
+from ..synthetic.arm import PERSON, ArmTakeSettings, is_arm_take, make_arm_take
 from ..synthetic.score import score_run
 from ..take.footage import open_take
 from ..take.take import read_take
@@ -83,9 +83,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Make the synthetic arm, run all stages, and compare with the truth. Settings of the group `sample` are those of the recording."""
+    """Make a synthetic recording, of a whole person unless `sample.subject` says otherwise, run all stages, and compare with the truth."""
     take, out, given = args.out / "take", args.out, overrides(args.set)
-    sample: ArmTakeSettings = from_table(ArmTakeSettings, given.pop("sample", {}), "[sample]")
+    sample: ArmTakeSettings = from_table(ArmTakeSettings, {"subject": PERSON, **given.pop("sample", {})}, "[sample]")
     settings_of({}, given, "")
     check_separate_folder(out)
     if not is_arm_take(take, sample):

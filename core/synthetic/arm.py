@@ -90,7 +90,7 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
         Cancelled: the monitor was cancelled; the folder then has no take.
     """
     settings, monitor, folder = settings or ArmTakeSettings(), monitor or Monitor(), Path(folder)
-    _clear(folder)
+    clear_recording(folder)
     studio = _studio(settings)
     write_rig(folder / "rig.toml", studio.rig)
     visible = []
@@ -212,7 +212,7 @@ def _rig(width_px: int, target_m: np.ndarray, size: float) -> Rig:
     return Rig(cameras=tuple(cameras), metadata=dict(source=MARK))
 
 
-def _clear(folder: Path) -> None:
+def clear_recording(folder: Path) -> None:
     """Clear the folder for a new recording. Only a synthetic recording is removed; rig.toml, which marks it, stays until it is replaced."""
     try:
         if folder.exists() and not _made_here(folder) and any(folder.iterdir()):

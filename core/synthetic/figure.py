@@ -17,17 +17,26 @@ from ..geometry.raster import vertex_normals
 SKIN = SkinSettings(contours=48, rays=64, cap_contours=10)
 HAND_SEMI_AXES_M = (0.036, 0.092, 0.018)  # across, along the forearm, through the palm
 HAND_CENTRE_M = 0.070  # beyond the wrist
+GREY = np.array([0.299, 0.587, 0.114])  # of red, green and blue (ITU-R BT.601)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Material:
-    """A solid texture in grey values under frontal light: mean, standard deviation, and the scale of the noise."""
+    """A solid texture in grey values under frontal light: mean, standard deviation, and the scale of the noise; with a `tint` (red, green,
+    blue), in colours that have these grey values."""
 
     mean: float
     contrast: float
     stretch: float = 1.0
     offset_m: float = 0.0
     textured: bool = False
+    tint: tuple[float, float, float] | None = None
+
+    @property
+    def bgr(self) -> np.ndarray:
+        """The factors (3,) of blue, green and red, whose grey value (ITU-R BT.601) is 1."""
+        rgb = np.array(self.tint or (1.0, 1.0, 1.0))
+        return np.asarray(rgb[::-1] / (rgb @ GREY))
 
 
 CLOTH = Material(mean=140.0, contrast=29.0, textured=True)

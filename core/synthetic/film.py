@@ -76,15 +76,18 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Layer:
-    """The image of some parts: light (H, W) float32 of each pixel, and depth z_cam [m] of `SAMPLES`² samples a pixel
-    (H · SAMPLES, W · SAMPLES) float32, inf where there is no surface."""
+    """The image of some parts: light (H, W) float32 of each pixel, its colour (H, W, 3) as factors of blue, green and red, None if all is
+    grey, and depth z_cam [m] of `SAMPLES`² samples a pixel (H · SAMPLES, W · SAMPLES) float32, inf where there is no surface."""
 
     light: np.ndarray
     depth_m: np.ndarray
+    bgr: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("light", "depth_m"):
             object.__setattr__(self, name, frozen(getattr(self, name), (None, None), np.float32, name))
+        if self.bgr is not None:
+            object.__setattr__(self, "bgr", frozen(self.bgr, (*self.light.shape, 3), np.float32, "bgr"))
 
 
 def paint(camera: Camera, parts: Sequence[Part], noise: SolidNoise, behind: Layer | None = None) -> Layer:
@@ -108,7 +111,15 @@ def paint(camera: Camera, parts: Sequence[Part], noise: SolidNoise, behind: Laye
     samples = np.repeat(light.reshape(-1, 1)[outline], SAMPLES**2, axis=1)
     samples[here >= 0] = _reflected(scene, raster, here[here >= 0], raster.xy_px[here[here >= 0]], noise)
     light.reshape(-1)[outline] = samples.mean(axis=1)
-    return Layer(light=light, depth_m=depth)
+    if all(material.tint is None for material in scene.materials):
+        return Layer(light=light, depth_m=depth, bgr=behind.bgr if behind is not None else None)
+    colours, owner = np.array([material.bgr for material in scene.materials], dtype=np.float32), scene.owner[raster.triangle]
+    bgr = np.ones((*light.shape, 3), np.float32) if behind is None or behind.bgr is None else behind.bgr.copy()
+    bgr.reshape(-1, 3)[pixel] = colours[owner[hit[::SAMPLES, ::SAMPLES].ravel()[pixel]]]
+    mixed = np.repeat(bgr.reshape(-1, 1, 3)[outline], SAMPLES**2, axis=1)
+    mixed[here >= 0] = colours[owner[here[here >= 0]]]
+    bgr.reshape(-1, 3)[outline] = mixed.mean(axis=1)
+    return Layer(light=light, depth_m=depth, bgr=bgr)
 
 
 def _planes(samples: np.ndarray) -> list[np.ndarray]:
@@ -143,12 +154,13 @@ def _reflected(scene: Scene, raster: Raster, which: np.ndarray, xy_px: np.ndarra
 
 
 def expose(layer: Layer, sensor: Sensor) -> np.ndarray:
-    """The expected grey values (H, W) of an image without noise.  (2)"""
-    return sensor.offset + sensor.gain * cv2.GaussianBlur(layer.light, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
+    """The expected values of an image without noise, (H, W) or, of a layer with colours, (H, W, 3).  (2)"""
+    light = layer.light if layer.bgr is None else layer.light[..., None] * layer.bgr
+    return sensor.offset + sensor.gain * cv2.GaussianBlur(light, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
 
 
 def digitize(expected: np.ndarray, sensor: Sensor, noise_level: float, rng: np.random.Generator) -> np.ndarray:
-    """The stored image (H, W) uint8; `noise_level` multiplies the sensor's noise (0: none).  (3)"""
+    """The stored image uint8, of the same shape; `noise_level` multiplies the sensor's noise (0: none).  (3)"""
     sigma = noise_level * np.sqrt(sensor.dark_sigma**2 + sensor.noise_per_grey * np.maximum(expected, 0))
     noisy = expected + sigma * rng.standard_normal(expected.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -21,8 +21,11 @@ from .subject import Subject
 SIDES = ("R", "L")
 JOINTS = ("neck", "pelvis", *(f"{joint}.{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in SIDES))
 LENGTHS = {"spine": 1.05, "chest": 0.97, "upper_arm": 1.04, "forearm": 0.95, "thigh": 1.03, "shin": 0.96}  # of the model's
-SHIRT, TROUSERS = replace(CLOTH, stretch=2.2), replace(CLOTH, mean=118.0, stretch=2.6, offset_m=0.31)
-SKIN = replace(BARE_SKIN, contrast=7.0)
+SHIRT = replace(CLOTH, stretch=2.2, tint=(0.55, 0.80, 0.82))
+TROUSERS = replace(CLOTH, mean=118.0, stretch=2.6, offset_m=0.31, tint=(0.62, 0.68, 0.88))
+SHOES = replace(CLOTH, mean=105.0, stretch=1.6, offset_m=0.53, tint=(0.85, 0.68, 0.55))
+SKIN = replace(BARE_SKIN, contrast=7.0, tint=(0.96, 0.78, 0.68))
+HAIR = replace(CLOTH, mean=62.0, contrast=14.0, stretch=0.9, offset_m=0.71, tint=(0.80, 0.66, 0.55))
 PLACE_M = np.array([0.0, 0.0, 0.93])  # of the pelvis at time 0
 SPEED_M_S = 0.25  # towards the cameras
 WALL_Y_M = 1.6
@@ -49,6 +52,12 @@ TORSO = Tube(
     ),
     power=2.6,
 )  # fmt: skip
+SEAT = Tube(  # of the trousers, over the torso
+    bones=TORSO.bones,
+    stations=((-0.20, 0.155, 0.110, -0.010), (0.00, 0.177, 0.123, -0.012), (0.10, 0.172, 0.119, -0.009)),
+    power=2.6,
+    material=TROUSERS,
+)
 ARM = Tube(
     bones=("upper_arm", "forearm"),
     stations=(
@@ -64,12 +73,27 @@ LEG = Tube(
     ),
     material=TROUSERS,
 )  # fmt: skip
-ENDS = {  # bone -> centre along it (fraction), half axes across, along, ahead [m], power
-    "neck": (0.45, (0.056, 0.075, 0.058), 2.0),
-    "head": (0.55, (0.074, 0.118, 0.095), 2.2),
-    "hand": (0.75, (0.042, 0.088, 0.018), 2.3),
-    "foot": (0.55, (0.042, 0.125, 0.038), 2.3),
-}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class End:
+    """A superellipsoid on a bone: its centre along the bone (fraction) and ahead [m], half axes across, along, ahead [m]."""
+
+    bone: str
+    along: float
+    half_axes_m: tuple[float, float, float]
+    ahead_m: float = 0.0
+    power: float = 2.0
+    material: Material = SKIN
+
+
+ENDS = (
+    End(bone="neck", along=0.45, half_axes_m=(0.056, 0.075, 0.058)),
+    End(bone="head", along=0.55, half_axes_m=(0.074, 0.118, 0.095), power=2.2),
+    End(bone="head", along=0.80, half_axes_m=(0.079, 0.082, 0.101), ahead_m=-0.010, power=2.2, material=HAIR),
+    End(bone="hand", along=0.75, half_axes_m=(0.042, 0.088, 0.018), power=2.3),
+    End(bone="foot", along=0.55, half_axes_m=(0.042, 0.125, 0.038), power=2.3, material=SHOES),
+)
 
 
 def person(swing_s: float) -> Subject:
@@ -133,19 +157,18 @@ def rest_parts(shape: BodyShape) -> list[tuple[Part, np.ndarray]]:
     """The parts in the rest pose, each with its weights (V, B)."""
     names = [bone.name for bone in shape.skeleton.bones]
     R, head = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
-    found = [tube_part(TORSO, TORSO.bones, names, shape.lengths_m, R, head)]
+    found = [tube_part(tube, tube.bones, names, shape.lengths_m, R, head) for tube in (TORSO, SEAT)]
     for tube in (ARM, LEG):
         found += [tube_part(tube, tuple(f"{b}.{side}" for b in tube.bones), names, shape.lengths_m, R, head) for side in SIDES]
-    for bone, (along, half_axes, power) in ENDS.items():
-        for name in (n for n in names if n.partition(".")[0] == bone):
+    for end in ENDS:
+        for name in (n for n in names if n.partition(".")[0] == end.bone):
             b = names.index(name)
-            centre = np.array([0.0, along * shape.lengths_m[b], 0.0])
-            own, triangles = superellipsoid(centre, np.array(half_axes), power, 36, 40)
+            centre = np.array([0.0, end.along * shape.lengths_m[b], end.ahead_m])
+            own, triangles = superellipsoid(centre, np.array(end.half_axes_m), end.power, 36, 40)
             vertices = own @ R[b].T + head[b]
-            material = TROUSERS if bone == "foot" else SKIN
             weights = np.zeros((len(vertices), len(names)))
             weights[:, b] = 1.0
-            found.append((Part(vertices_m=vertices, triangles=triangles, rest_m=vertices, material=material), weights))
+            found.append((Part(vertices_m=vertices, triangles=triangles, rest_m=vertices, material=end.material), weights))
     return found
 
 

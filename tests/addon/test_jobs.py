@@ -63,11 +63,11 @@ def test_an_operator_is_alone(jobs: ModuleType) -> None:
     try:
         with module.alone():
             held = seen[0]
-            time.sleep(0.05)  # a thread that goes on counts some thousands
+            threading.Event().wait(0.05)  # a thread that goes on counts some thousands; a busy machine only asks less
             assert seen == [held, held], "the finder was asked, and the job stands still"
             late = jobs.Job(lambda monitor: seen.append(-1))
             late.start()
-            time.sleep(0.05)
+            threading.Event().wait(0.05)
             assert seen == [held, held], "no job begins meanwhile"
     finally:
         session.finders.remove(finder)

@@ -20,6 +20,10 @@ LONGEST_S = 0.5  # on a machine that does nothing else
 
 
 def steps() -> drive.Steps:
+    take, arm = drive.HERE / "arm", importlib.import_module("bl_ext.user_default.tricap.core.synthetic.arm")
+    arm.make_arm_take(take, arm.ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none"))
+    bpy.ops.tricap.open_take(directory=str(take))
+    bpy.context.scene.tricap.out = str(take / "results")
     yield from drive.sidebar("VIEW_3D", "Tricap")
     with display.Pulse() as idle:
         yield from redrawn(5)
@@ -63,7 +67,7 @@ def judge(running: np.ndarray, idle: np.ndarray) -> None:
 
 
 def begin() -> None:
-    """Start the sample as its button does; it goes on where it was stopped."""
+    """Start the run as its button does; it goes on where it was stopped."""
     area = drive.area_of("VIEW_3D")
     with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
-        bpy.ops.tricap.load_sample("INVOKE_DEFAULT")
+        bpy.ops.tricap.run("INVOKE_DEFAULT")
