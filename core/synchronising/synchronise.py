@@ -6,7 +6,9 @@ needs time to travel: between cameras at a distance b of each other a noise arri
 contains (uniformly distributed directions: b / √3 / 343 m/s). Light needs none (`light`): a lamp that is switched, or a flash, gives the
 beginning to a part of an image. Time codes (`time_code`) give it to an image or so, if the clocks of the cameras were set together: each
 camera counts whole images, so the sigma is that of a uniform distribution. The rays (`checking.timing`) have no such error; with a rig they
-measure what is left, or everything where there is nothing else and the views began within the reach of `tricap check`.
+measure what is left, or everything where there is nothing else and the views began within the reach of `tricap check`. Views that began
+further apart, without sound, light and time codes, are brought together where the same motion is seen in both (`motion`), if the rays
+confirm that.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,12 +20,13 @@ import numpy as np
 from ..checking.timing import TimeOffset, estimate_offsets
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..images.sequence import open_sequence
+from ..images.sequence import ImageSequence, open_sequence
 from ..take.clock import Clock, clocks_of
 from ..take.footage import Footage, open_take
 from ..take.take import Take, View
 from ..take.writing import read_table, write_table
 from .light import LightChange, brightness_of, light_changes, offset_by_light
+from .motion import energy_of, offsets_by_motion
 from .sound import Sound, offset_between, read_wav
 from .time_code import TimeCode, read_time_code, started_after
 
@@ -34,6 +37,7 @@ TRACKING = 2.0  # times the sigma of the rays, and …
 LEAST_IMAGES = 0.005  # … images: by how much tracked points are wrong in the same way in all frames (measured, synthetic footage)
 CONTRADICTION = 5.0  # sigmas by which rays and sound may differ, and more than …
 IMAGE_LATENESS_S = 0.1  # … by which the images in a file are later than its sound
+MOTION_SIGMA_S = 0.1  # of a beginning by the motion alone, which is none
 MovieSound = Callable[[Path], Sound | None]  # the sound of a movie's own track, None without one
 
 
@@ -45,7 +49,7 @@ class ViewTiming:
     start_s: float
     sigma_s: float
     drift_ppm: float
-    method: str  # "reference", "sound", "light", "time code", "rays", one of them “and rays”, or "" where it was not found
+    method: str  # "reference", "sound", "light", "time code", "rays", one of them or "motion" “and rays”, or "" where it was not found
     problem: str = ""  # why it was not found, and what to do
 
     @property
@@ -95,11 +99,17 @@ def synchronise(take: Take, monitor: Monitor, movie_sound: MovieSound | None = N
         else:
             seen = lights.timing(view, part) or _by_time_code(take, view)
             timings[view.name] = seen or _lost(take, view, a, b, sounded=movie_sound is not None)
-    return (
-        _with_rays(take, [timings[v.name] for v in take.views], monitor)
-        if take.rig_path.is_file()
-        else tuple(timings[v.name] for v in take.views)
-    )
+    found = tuple(timings[v.name] for v in take.views)
+    if not take.rig_path.is_file():
+        return found
+    found = _with_rays(take, found, monitor)
+    audible = {name for name, sound in sounds.items() if sound is not None and not sound.silent}
+    lost = [timing for timing in found if not timing.found and not {reference.name, timing.view} <= audible]
+    motions = _Motions(take)
+    by_motion = {
+        t.view: motions.timing(t, timings[reference.name], monitor.part("finding the motion", n, len(lost))) for n, t in enumerate(lost)
+    }
+    return tuple(by_motion.get(timing.view, timing) for timing in found)
 
 
 def write_starts(folder: Path, timings: tuple[ViewTiming, ...]) -> bool:
@@ -156,13 +166,49 @@ class _Lights:
 
     def _of(self, view: View, monitor: Monitor) -> tuple[tuple[LightChange, ...], Clock]:
         if view.name not in self._found:
-            sequence = open_sequence(self._take.folder, images=view.images, movie=view.movie, view=view.name)
-            timed = replace(self._take, views=(replace(view, fps=view.fps or _rate(self._take)),))
+            sequence, clock = _timed(self._take, view)
             brightness = brightness_of(sequence, self._take.rows_at(0), monitor)
-            clock = clocks_of(timed, (sequence,))[0]
             known = abs(clock.readout_s / clock.period_s) if clock.readout_s else None
             self._found[view.name] = light_changes(brightness[:, ::-1] if clock.readout_s < 0 else brightness, known), clock
         return self._found[view.name]
+
+
+class _Motions:
+    """The motion in the views of a take, found when it is needed."""
+
+    def __init__(self, take: Take) -> None:
+        self._take, self._found = take, dict[str, tuple[np.ndarray, np.ndarray]]()
+
+    def timing(self, lost: ViewTiming, reference: ViewTiming, monitor: Monitor) -> ViewTiming:
+        """The beginning of a view that is `lost`, where the same motion is seen in it and the reference view, and the rays confirm it."""
+        view = next(v for v in self._take.views if v.name == lost.view)
+        a = self._of(self._take.views[self._take.reference], monitor)
+        b = self._of(replace(view, start_s=0.0, drift_ppm=0.0, offset_frames=0), monitor)
+        pair = replace(self._take, views=(self._take.views[self._take.reference], view), reference_view=reference.view)
+        for offset_s in offsets_by_motion(a[0], b[0], a[1], b[1]):
+            candidate = _timing(view, offset_s, MOTION_SIGMA_S, 0.0, "motion")
+            try:
+                found = _with_rays(pair, [reference, candidate], monitor)[1]
+            except InputError:  # the views would have no frame in common
+                continue
+            if found.method == "motion and rays":
+                return found
+        return lost
+
+    def _of(self, view: View, monitor: Monitor) -> tuple[np.ndarray, np.ndarray]:
+        """The energies (n − 1,) of a view, and their times (n − 1,)."""
+        if view.name not in self._found:
+            sequence, clock = _timed(self._take, view)
+            energy = energy_of(sequence, self._take.rows_at(0), monitor)
+            self._found[view.name] = energy, np.array([clock.time_s(n + 0.5) for n in range(len(energy))])
+        return self._found[view.name]
+
+
+def _timed(take: Take, view: View) -> tuple[ImageSequence, Clock]:
+    """The images of a view, and its clock."""
+    sequence = open_sequence(take.folder, images=view.images, movie=view.movie, view=view.name)
+    timed = replace(take, views=(replace(view, fps=view.fps or _rate(take)),))
+    return sequence, clocks_of(timed, (sequence,))[0]
 
 
 def _moments(changes: Sequence[LightChange], clock: Clock) -> np.ndarray:
@@ -222,7 +268,7 @@ def with_starts(take: Take, timings: Mapping[str, ViewTiming]) -> Take:
     return replace(take, views=views)
 
 
-def _with_rays(take: Take, timings: list[ViewTiming], monitor: Monitor) -> tuple[ViewTiming, ...]:
+def _with_rays(take: Take, timings: Sequence[ViewTiming], monitor: Monitor) -> tuple[ViewTiming, ...]:
     """The beginnings improved by the rays of moving points, where these are exact enough."""
     started = with_starts(take, {t.view: t for t in timings})
     views = tuple(replace(v, fps=v.fps or _rate(take)) for v in started.views)  # with clocks, views may differ in length

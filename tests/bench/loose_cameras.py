@@ -1,11 +1,11 @@
 """A take of three views at 24, 30 and 60 images a second, started up to ten minutes apart, against the same take in step.
 
-    .venv/py3.13/bin/python tests/bench/loose_cameras.py FOLDER [--width 480] [--frames 14]
+    .venv/py3.13/bin/python tests/bench/loose_cameras.py FOLDER [--width 480] [--frames 14] [--silent]
 
 FOLDER/step is a swinging arm at 30 images per second. FOLDER/loose shows the same: C is the same view; L began 587 s before it, at 24
 images per second with a clock that is slow by 50 ppm; R at 60, fast by 25 ppm. L and R have rolling shutters, of which six bands are
 filmed. All have sound. The beginnings are found and written by `tricap synchronise`; then clouds, trajectories and joints of both takes
-are compared with the truth. Some minutes of CPU; what is in FOLDER is not made again.
+are compared with the truth. Some minutes of CPU; what is in FOLDER is not made again. With `--silent` the sound is deleted.
 """
 
 import argparse
@@ -101,7 +101,9 @@ def make(folder: Path, width_px: int) -> None:
 def started(folder: Path) -> None:
     """Find the beginnings by sound, then with the rays; print their errors in the middle of what all views show, and write them."""
     take = read_take(folder)
-    for method, shown in (("sound", replace(take, rig_path=folder / "none.toml")), ("sound and rays", take)):
+    heard = any(folder.glob("*.wav"))
+    by_sound = [("sound", replace(take, rig_path=folder / "none.toml"))] if heard else []
+    for method, shown in (*by_sound, ("sound and rays" if heard else "rays", take)):
         timings = synchronise(shown, Monitor())
         for timing in timings:
             for view in (v for v in VIEWS if v.name == timing.view):
@@ -118,10 +120,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--frames", type=int, default=14, help=f"that are measured, of {FRAMES}")
+    parser.add_argument("--silent", action="store_true")
     args = parser.parse_args()
     folder = args.folder.resolve()
-    if not (folder / "loose" / "C.wav").is_file():
+    if not (folder / "loose" / "take.toml").is_file():
         make(folder, args.width)
+    for sound in (folder / "loose").glob("*.wav") if args.silent else ():
+        sound.unlink()
     started(folder / "loose")
     for name in ("step", "loose"):
         for stage in ("measure", "track", "fit"):
