@@ -20,6 +20,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,9 +91,14 @@ def settle(pauses: int = 4) -> Steps:
         area.tag_redraw()
     for _ in range(pauses):
         yield
-    with bpy.context.temp_override(window=window()):
+    with override(window=window()):
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
     yield
+
+
+def override(**members: object) -> AbstractContextManager[None]:
+    """`temp_override` for operators, as the add-on uses it: in Blender 4.5 no thread may run meanwhile."""
+    return importlib.import_module("bl_ext.user_default.tricap.addon.alone").override(**members)
 
 
 # ---- mouse and keys --------------------------------------------------------------------------------------------------
@@ -235,7 +241,7 @@ def buttons(area: bpy.types.Area, kind: str = "UI", until: str | None = None) ->
 def under_pointer(area: bpy.types.Area, region: bpy.types.Region) -> str:
     """What Blender's own “Copy Python Command” or “Copy Full Data Path” says of the button that the pointer is over; "" without one."""
     wm = bpy.context.window_manager
-    with bpy.context.temp_override(window=window(), area=area, region=region):
+    with override(window=window(), area=area, region=region):
         for copy in (bpy.ops.ui.copy_python_command_button, bpy.ops.ui.copy_data_path_button):
             if copy.poll():
                 wm.clipboard = ""
@@ -344,7 +350,7 @@ def reports() -> list[str]:
             if hasattr(area.spaces.active, f"show_report_{kind}"):
                 setattr(area.spaces.active, f"show_report_{kind}", kind in ("info", "error", "warning"))
         wm.clipboard = ""
-        with bpy.context.temp_override(window=window(), area=area, region=region_of(area)):
+        with override(window=window(), area=area, region=region_of(area)):
             bpy.ops.info.select_all(action="SELECT")
             bpy.ops.info.report_copy()
         return [line for line in wm.clipboard.splitlines() if line and not line.startswith("bpy.")]

@@ -52,7 +52,7 @@ def views() -> dict[str, bpy.types.Area]:
 def opened() -> drive.Steps:
     """A workspace with an editor per view; the user's own stays."""
     before = len(drive.window().screen.areas)
-    with bpy.context.temp_override(window=drive.window()):
+    with drive.override(window=drive.window()):
         bpy.ops.tricap.open_views()
     yield from drive.wait_for(lambda: drive.window().workspace.name == CLICKS and len(views()) == 3, 20, "each view has an editor")
     yield from drive.pause(1.0)
@@ -130,7 +130,7 @@ def watched() -> drive.Steps:
         drive.check((display.pixels() != plain).any(axis=2).sum() > 500, f"{name} are seen")
         yield from drive.shot(f"2_{name}")
         setattr(shown, name, False)
-    with bpy.context.temp_override(window=drive.window()):
+    with drive.override(window=drive.window()):
         bpy.ops.tricap.open_views(show="tracks")
     yield from drive.wait_for(lambda: drive.region_of(views()["R"], "UI").width > 1, 20, "the views open with the switches beside them")
     drive.check(shown.tracks, "and with the trajectories")

@@ -105,7 +105,7 @@ def in_space() -> drive.Steps:
     yield from drive.wait_for(lambda: any(a.ui_type == "VIEW_3D" for a in drive.window().screen.areas), 20, "the 3D view is open")
     area = drive.area_of("VIEW_3D")
     bpy.context.scene.frame_set(1)
-    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+    with drive.override(window=drive.window(), area=area, region=drive.region_of(area)):
         for thing in bpy.context.view_layer.objects:
             thing.select_set(thing.name.startswith(("point ", "Velocities of Points")))
         bpy.ops.view3d.view_selected()

@@ -34,7 +34,7 @@ def steps() -> drive.Steps:
     area.ui_type = "CLIP_EDITOR"
     area.spaces.active.clip = clip
     yield from drive.settle()
-    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+    with drive.override(window=drive.window(), area=area, region=drive.region_of(area)):
         bpy.ops.clip.view_all(fit_view=True)
     yield from clicked(area, at)
     yield from joined(area, clip, at)
@@ -90,7 +90,7 @@ def followed(area: bpy.types.Area, take: Path, clip: bpy.types.MovieClip, at: np
     area.ui_type = "VIEW_3D"
     yield from drive.settle()
     drive.check(bpy.data.objects["Cube"].hide_get(), "Blender's cube makes room")
-    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+    with drive.override(window=drive.window(), area=area, region=drive.region_of(area)):
         module("addon.operators.build_scene").frame_in_views(None, bpy.context, bpy.data.objects["Footage"], front=True)
     yield from drive.pause(0.5)
     view = area.spaces.active.region_3d

@@ -45,7 +45,7 @@ def export_stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
         scene.frame_end = scene.frame_start + frames - 1
         now = scene.frame_current
         yield from drive.move(*drive.middle(area))
-        with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area, "WINDOW")):
+        with drive.override(window=drive.window(), area=area, region=drive.region_of(area, "WINDOW")):
             bpy.ops.tricap.export("INVOKE_DEFAULT", kind="bvh")
         yield from drive.choose("export", file.parent, file.name)
         if stopped:

@@ -69,5 +69,5 @@ def judge(running: np.ndarray, idle: np.ndarray) -> None:
 def begin() -> None:
     """Start the run as its button does; it goes on where it was stopped."""
     area = drive.area_of("VIEW_3D")
-    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+    with drive.override(window=drive.window(), area=area, region=drive.region_of(area)):
         bpy.ops.tricap.run("INVOKE_DEFAULT")

@@ -209,7 +209,7 @@ def edited(file: Path) -> drive.Steps:
     for thing in scene.objects:
         thing.select_set(thing == target)
     bpy.context.view_layer.objects.active = target
-    with bpy.context.temp_override(window=drive.window(), area=area, region=drive.region_of(area)):
+    with drive.override(window=drive.window(), area=area, region=drive.region_of(area)):
         bpy.ops.object.mode_set(mode="POSE")
     target.data.bones.active = target.data.bones["forearm.R"]
     selected = target.pose.bones if bpy.app.version >= (5, 0) else target.data.bones
