@@ -60,6 +60,7 @@ def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+        job.engine = of_this_machine()
         for name in names:
             getattr(pipeline, name)(job, monitor)
         return _summary(job, args.json)
@@ -90,7 +91,7 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_separate_folder(out)
     if not is_arm_take(take, sample):
         make_arm_take(take, sample, monitor)
-    job = pipeline.run(take, out, given, monitor)
+    job = pipeline.run(take, out, given, monitor, engine=of_this_machine())
     lines, blend = _build_scene(job, args, monitor), out / "body.blend"
     return [
         str(job),

@@ -55,6 +55,7 @@ from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
 from .around_clicks import FITTED_WITH, fitted_with
 from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
+from .engine import Engine
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
@@ -165,14 +166,17 @@ def run(
     *,
     restart: bool = False,
     frames: tuple[int, int] | None = None,
+    engine: Engine | None = None,
 ) -> Run:
     """Everything that needs no Blender, from the images to the report. A stopped run goes on where it was; `restart` begins anew.
+    `engine`: where the frames are measured; by default in this process.
 
     Raises:
         InputError: something of the input needs mending; nothing that was computed is lost.
         Cancelled: what is done is kept.
     """
     with open_run(take_folder, out, overrides, frames, restart=restart) as job:
+        job.engine = engine
         all_stages(job, monitor or Monitor())
     return job
 

@@ -24,7 +24,7 @@ def test_every_knob_of_the_recording_and_of_the_run(tmp_path: Path, monkeypatch:
     for name, result in (("score_run", ""), ("_build_scene", [])):
         monkeypatch.setattr(stages, name, lambda *given, result=result: result)
 
-    def run(take: Path, out: Path, given: Any, monitor: Any) -> Any:
+    def run(take: Path, out: Path, given: Any, monitor: Any, engine: Any) -> Any:
         asked.append(given)
         return SimpleNamespace(record={"warnings": []})
 
