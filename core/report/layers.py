@@ -12,7 +12,7 @@ from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, shade, vertex_normals
 from .drawing import add_axes, add_scale, small_text
-from .person import Mesh
+from .person import Coloured, Mesh
 
 PANEL_PX = (330, 520)  # width, height
 GROUND, EDGE = (28, 28, 28), (90, 90, 90)
@@ -20,14 +20,17 @@ BONE_LINE, JOINT_DOT = (200, 215, 225), (60, 190, 250)
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
 KIND_COLOURS = {BONE: (205, 225, 235), MUSCLE: (85, 85, 215), FAT: (90, 205, 240), FLESH: (120, 140, 220)}  # BGR
 DISTANCE_M, MARGIN_M = 30.0, 0.16  # far away, so that the picture is nearly to one scale
-TITLES = ("a  skeleton", "b  metaballs", "c  blended surface", "d  finished skin")
+TITLES = ("a  skeleton", "b  metaballs", "c  blended surface", "d  finished skin", "e  with its texture")
+FACTOR, DARKEST = 2, 0.55  # samples across a pixel of the last panel, and its least light: the texture has shades of its own
 
 
-def layers_picture(shape: BodyShape, skin: Skin, finished: Mesh) -> np.ndarray:
-    """The four layers side by side; `skin` is that of the metaballs and `finished` that of the person, both in the rest pose."""
+def layers_picture(shape: BodyShape, skin: Skin, finished: Mesh, coloured: Coloured | None = None) -> np.ndarray:
+    """The layers side by side, in the rest pose: `skin` is that of the metaballs, `finished` that of the person, and `coloured` the same
+    with its texture."""
     rest = np.zeros(len(shape.skeleton.dofs))
     camera, px_per_m = _in_front(shape, rest)
     panels = [_skeleton(shape, rest, camera), _balls(shape, rest, camera), _polygons(skin, camera), _shaded(finished, camera)]
+    panels += [_textured(coloured, camera)] if coloured is not None else []
     for panel, title in zip(panels, TITLES):
         small_text(panel, title, (10, 20))
         add_scale(panel, px_per_m)
@@ -96,3 +99,12 @@ def _shaded(skin: Mesh, camera: Camera) -> np.ndarray:
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = covered[..., None]
     return ((1 - alpha) * _empty() + alpha * light[..., None] * SKIN_COLOUR).clip(0, 255).astype(np.uint8)
+
+
+def _textured(skin: Coloured, camera: Camera) -> np.ndarray:
+    raster = rasterize(camera, skin.vertices_m, skin.triangles, factor=FACTOR)
+    normal = raster.interpolate(vertex_normals(skin.vertices_m, skin.triangles), skin.triangles) @ camera.R_cam_world.T
+    facing = np.clip(-normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12), 0, 1)
+    samples = np.tile(np.array(GROUND, np.uint8), (*raster.shape, 1))
+    samples.reshape(-1, 3)[raster.sample] = (DARKEST + (1 - DARKEST) * facing)[:, None] * skin.colours(raster)
+    return np.asarray(cv2.resize(samples, camera.size_px, interpolation=cv2.INTER_AREA))

@@ -6,6 +6,7 @@ The page begins with what came out and what is doubtful; then come the figures o
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from .graphs import curve_graph
 from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
 from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
-from .person import SkinAt, skin_in
+from .person import SkinAt, coloured_skin, skin_in
 from .silhouettes import Silhouettes
 from .trails import trail_pictures, vector_pictures
 
@@ -100,7 +101,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
         tracks, camera = report.trajectories, report.footage.rig.cameras[report.footage.take.reference]
         vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2)
         shown |= {f"vectors_{name}.png": picture for name, picture in zip(("velocity", "acceleration"), vectors)}
-    shown |= _layers(report, skin_at)
+    shown |= _layers(report, results.path("skin"), skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
@@ -155,15 +156,18 @@ def _first_middle_last(report: Report) -> list[int]:
     return sorted({0, min(sorted(compared), key=lambda i: abs(i - count // 2)), count - 1})
 
 
-def _layers(report: Report, skin_at: SkinAt | None) -> dict[str, tuple[str, np.ndarray]]:
-    """The picture of the body's layers; none without a skin."""
+def _layers(report: Report, folder: Path, skin_at: SkinAt | None) -> dict[str, tuple[str, np.ndarray]]:
+    """The picture of the body's layers; none without a skin. `folder`: that of the skin."""
     if report.body is None or skin_at is None:
         return {}
     shape, rest = report.body.shape, np.zeros(len(report.body.shape.skeleton.dofs))
     settings = SkinSettings(**report.record["settings"]["skin"])
     words = "The fitted body in its rest pose, from the front: skeleton; metaballs, each as the ellipsoid that it shows alone "
     caption = f"{words}({kinds_shown(shape)}); polygons of the surface that blends them; the finished skin"
-    return {"layers.png": (caption, layers_picture(shape, body_skin(shape_with_ends(shape, settings), rest, settings), skin_at(rest)))}
+    coloured = coloured_skin(folder, report.body, settings)
+    caption += "" if coloured is None else "; the same with the colours of the footage"
+    metaballs = body_skin(shape_with_ends(shape, settings), rest, settings)
+    return {"layers.png": (caption, layers_picture(shape, metaballs, skin_at(rest), coloured))}
 
 
 def _shots(report: Report, skin_at: SkinAt | None, monitor: Monitor) -> list[Shot]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..body.motion import BodyFit
@@ -13,7 +14,12 @@ from ..body.skin.extremities import shape_with_ends
 from ..body.skin.fingers import shape_for_skin
 from ..body.skin.person_skin import REST, cage, read_skin
 from ..body.skin.posed import Poser, skins_in
+from ..body.skin.texture import TEXTURE
 from ..foundation.errors import InputError
+from ..geometry.raster import Raster
+from ..images.sequence import decoded
+
+MOST_REMAPPED = 30_000  # OpenCV's largest width of a map is 32,767
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -23,6 +29,26 @@ class Mesh:
     vertices_m: np.ndarray  # (V, 3)
     triangles: np.ndarray  # (F, 3)
     weights: np.ndarray  # (V, B)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Coloured:
+    """The skin of the rest pose with its texture: places (F, 3, 2) of the triangles' corners in 0…1, v upwards."""
+
+    vertices_m: np.ndarray  # (V, 3)
+    triangles: np.ndarray  # (F, 3)
+    uv: np.ndarray  # (F, 3, 2)
+    bgr: np.ndarray  # (h, w, 3) uint8
+
+    def colours(self, raster: Raster) -> np.ndarray:
+        """The texture (N, 3) at the samples of a raster of the triangles."""
+        weights = raster.pieces.weights(raster.piece, raster.xy_px)
+        h, w = self.bgr.shape[:2]
+        xy = np.einsum("nc,nck->nk", weights, self.uv[raster.triangle]) * [w, -h] + [-0.5, h - 0.5]
+        at = xy.astype(np.float32).reshape(1, -1, 2)
+        parts = [at[:, i : i + MOST_REMAPPED] for i in range(0, at.shape[1], MOST_REMAPPED)]
+        found = [cv2.remap(self.bgr, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0] for part in parts]
+        return np.concatenate(found) if found else np.zeros((0, 3), np.uint8)
 
 
 SkinAt = Callable[[np.ndarray], Mesh]  # of a pose (D,)
@@ -41,6 +67,17 @@ def skin_in(folder: Path, body: BodyFit | None, settings: SkinSettings) -> SkinA
     triangles = np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
     poser, vertices, weights = Poser(person, skin.weights[rows]), skin.vertices_m[rows], skin.weights[rows] @ _carriers(person, body.shape)
     return lambda pose: Mesh(vertices_m=poser.posed(vertices, pose), triangles=triangles, weights=weights)
+
+
+def coloured_skin(folder: Path, body: BodyFit, settings: SkinSettings) -> Coloured | None:
+    """The run's skin in the rest pose with its texture; None where it has none, or they cannot be read."""
+    try:
+        skin, picture = read_skin(folder / REST, shape_for_skin(body.shape, settings)), decoded(folder / TEXTURE)
+    except InputError:
+        return None
+    triangles, uv = (np.concatenate([table[:, [0, 1, 2]], table[:, [0, 2, 3]]]) for table in (skin.faces, skin.uv))
+    bgr = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+    return Coloured(vertices_m=skin.vertices_m, triangles=triangles, uv=uv, bgr=np.ascontiguousarray(bgr[:, :, :3]))
 
 
 def _of_metaballs(body: BodyFit, settings: SkinSettings) -> SkinAt | None:

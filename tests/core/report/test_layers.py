@@ -8,9 +8,11 @@ from tricap.core.body.complete import complete_shape
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.raster import rasterize
 from tricap.core.report.drawing import add_axes, add_scale, length_words
 from tricap.core.report.layers import GROUND, KIND_COLOURS, PANEL_PX, kinds_shown, layers_picture
-from tricap.core.report.person import Mesh
+from tricap.core.report.person import Coloured, Mesh
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,34 @@ def test_each_layer_is_within_the_next(panels: list[np.ndarray]) -> None:
     red = np.array(KIND_COLOURS["muscle"])
     muscle = np.abs(panels[1][covered(panels[1])].astype(float) / red - (panels[1][covered(panels[1])][:, 2:] / red[2])).max(axis=1) < 0.1
     assert 0.02 < muscle.mean() < 0.6, "muscles in their colour, between the bones in theirs"
+
+
+def test_the_texture_lies_upright_on_the_skin() -> None:
+    """A square before a camera, whose picture has red above, green below, and blue at the right."""
+    picture = np.zeros((40, 40, 3), np.uint8)
+    picture[:20], picture[20:], picture[:, 30:] = (0, 0, 255), (0, 255, 0), (255, 0, 0)
+    corners = np.array([[-1.0, 1.0, 4.0], [1.0, 1.0, 4.0], [1.0, -1.0, 4.0], [-1.0, -1.0, 4.0]])  # y downwards
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])[:, ::-1]
+    skin = Coloured(vertices_m=corners, triangles=triangles, uv=uv[triangles], bgr=picture)
+    camera = Camera(name="C", size_px=(80, 80), matrix=np.array([[120.0, 0, 39.5], [0, 120.0, 39.5], [0, 0, 1]]), distortions=np.zeros(5),
+                    R_cam_world=np.eye(3), t_cam_world_m=np.zeros(3))  # fmt: skip
+    raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
+    shown = np.zeros((*raster.shape, 3), np.uint8)
+    shown.reshape(-1, 3)[raster.sample] = skin.colours(raster)
+    assert shown[20, 20].tolist() == [0, 0, 255] and shown[60, 20].tolist() == [0, 255, 0] and shown[40, 66].tolist() == [255, 0, 0]
+
+
+def test_with_a_texture_there_is_one_more_layer() -> None:
+    shape = default_shape(read_model("arm.R"))
+    skin = body_skin(shape, np.zeros(len(shape.skeleton.dofs)))
+    mesh = Mesh(vertices_m=skin.vertices_m, triangles=skin.triangles, weights=skin.weights)
+    blue = np.full((8, 8, 3), (200, 0, 0), np.uint8)
+    coloured = Coloured(vertices_m=skin.vertices_m, triangles=skin.triangles, uv=np.full((len(skin.triangles), 3, 2), 0.5), bgr=blue)
+    *_, shaded, textured = np.split(layers_picture(shape, skin, mesh, coloured), 5, axis=1)
+    there = covered(textured)
+    assert (there & covered(shaded)).sum() > 0.97 * there.sum() and textured[there].max(axis=0).tolist()[0] > 150
+    assert np.median(textured[there][:, 1:]) == 0
 
 
 @pytest.mark.parametrize(
