@@ -6,6 +6,7 @@ Exit codes: 0 done, 2 invalid input (one sentence on stderr), 130 cancelled (fin
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -41,7 +42,8 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
         monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress()
     try:
         check_outputs(args)
-        with _interrupts(monitor), threadpool_limits(1, user_api="blas"):  # those that Blender has loaded
+        with _interrupts(monitor), threadpool_limits(1, user_api="blas"), warnings.catch_warnings():  # BLAS that Blender has loaded
+            warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of numbers in damaged files: the sentence says what is wrong
             lines = args.run(args, monitor)
         for line in lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", []):
             streams.write_line(line, sys.stdout)

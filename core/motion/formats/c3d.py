@@ -27,6 +27,7 @@ from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 BLOCK = 512
 INTEL, DEC, MIPS = 84, 85, 86  # processor types: byte order and floats
 RESIDUAL_SCALE_MM = 0.1
+LARGEST_SCALE = 1e6  # of the 16-bit numbers, in the file's unit
 MOST_WORD = 65535  # of the header's 16-bit numbers
 BATCH = 255  # labels in one parameter
 POSE = 17  # numbers per segment and frame
@@ -249,6 +250,8 @@ def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
     words = number.words(data[2:24])
     n, analogue, first, last, start = int(words[0]), int(words[1]), int(words[2]), int(words[3]), int(words[7])
     scale, fps = float(number.floats(data[12:16])[0]), float(number.floats(data[20:24])[0])
+    if not 0 < abs(scale) < LARGEST_SCALE:
+        raise InputError(f"{path} has the scale {scale:g}, in which no point can be stored; export it again.")
     first, t = _range(table, first, last)
     check_size((t, n, 4), len(data), path)
     size = 4 if scale < 0 else 2

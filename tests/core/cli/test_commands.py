@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -423,3 +424,15 @@ def test_a_finished_run_is_not_computed_again(take: Path, tmp_path: Path, capfd:
     shutil.rmtree(out / "report")
     main.main([*argv, "--quiet"])
     assert computed.pop()
+
+
+def test_numbers_that_overflow_are_no_second_sentence(small: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def seeds(args: Any, monitor: Monitor) -> list[str]:
+        assert np.isnan(np.float64(np.inf) * np.zeros(1)).all()
+        raise InputError("The file is damaged.")
+
+    monkeypatch.setattr(stages, "seeds", seeds)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert main.main(["seeds", str(small), "--quiet"]) == 2
+    assert not told and capsys.readouterr().err.splitlines() == ["tricap: The file is damaged."]

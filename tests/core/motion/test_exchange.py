@@ -35,6 +35,17 @@ def cloud(sigma: bool = True) -> Markers:
     return Markers(names=("shoulder.R", "elbow.R", "wrist, right"), fps=59.94, frames=np.arange(40) + 12, xyz_m=xyz, sigma_m=sigma_m)
 
 
+@pytest.mark.parametrize("scale", [np.inf, -np.inf, np.nan, 0.0, 1e30])
+def test_a_c3d_file_with_a_scale_that_is_none_is_refused(tmp_path: Path, scale: float) -> None:
+    file = tmp_path / "a.c3d"
+    write_c3d(file, Markers(names=("a",), fps=50.0, frames=[1], xyz_m=np.ones((1, 1, 3)), sigma_m=np.full((1, 1), 1e-3)))
+    data = bytearray(file.read_bytes())
+    data[12:16] = np.float32(scale).tobytes()
+    file.write_bytes(data)
+    with pytest.raises(InputError, match="in which no point can be stored; export it again"):
+        read_c3d(file)
+
+
 @pytest.mark.parametrize("kind", ["trc", "c3d", "csv"])
 @pytest.mark.parametrize("axes", ["Z up", "Y up", "OpenSim"])
 def test_points_come_back(tmp_path: Path, kind: str, axes: str) -> None:
