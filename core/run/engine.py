@@ -62,6 +62,7 @@ def dask_client(engine: Engine) -> Iterator[Any]:
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # of its HTTP server: by default one port, which another batch may have
             memory_limit=0,
             silence_logs=50,
             env=thread_limits(engine.workers, os.cpu_count() or 1),
