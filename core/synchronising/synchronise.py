@@ -109,7 +109,9 @@ def synchronise(take: Take, monitor: Monitor, movie_sound: MovieSound | None = N
     by_motion = {
         t.view: motions.timing(t, timings[reference.name], monitor.part("finding the motion", n, len(lost))) for n, t in enumerate(lost)
     }
-    return tuple(by_motion.get(timing.view, timing) for timing in found)
+    found = tuple(by_motion.get(timing.view, timing) for timing in found)
+    moved = any(timing.method.startswith("motion") for timing in found)
+    return _with_rays(take, found, monitor) if moved else found  # again, in the frames that all views show
 
 
 def write_starts(folder: Path, timings: tuple[ViewTiming, ...]) -> bool:
@@ -290,7 +292,7 @@ def _improved(take: Take, footage: Footage, timing: ViewTiming, offset: TimeOffs
         return replace(timing, method="", problem=f"{why}. {advice}")
     view = next(v for v in take.views if v.name == timing.view)
     before_s = timing.start_s if timing.found else _zero(view, rate)
-    method = f"{timing.method} and rays" if timing.found else "rays"
+    method = timing.method if timing.method.endswith("rays") else f"{timing.method} and rays" if timing.found else "rays"
     return replace(timing, start_s=before_s + late_s, sigma_s=sigma_s, method=method, problem="")
 
 
