@@ -8,7 +8,7 @@ So threads wait meanwhile: jobs at the next look whether they were cancelled, fi
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import bpy
@@ -55,9 +55,5 @@ def alone() -> Iterator[None]:
 @contextmanager
 def override(**members: Any) -> Iterator[None]:
     """`temp_override` for operators: alone, where Blender needs that."""
-    if not NEEDED:
-        with bpy.context.temp_override(**members):
-            yield
-        return
-    with alone(), bpy.context.temp_override(**members):
+    with alone() if NEEDED else nullcontext(), bpy.context.temp_override(**members):
         yield

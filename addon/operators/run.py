@@ -71,15 +71,15 @@ class Run(StageOperator, bpy.types.Operator):
 
 
 def measure(
-    take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor
+    take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor, *, restart: bool = False
 ) -> "tuple[TakeRun, Contents | None]":
-    """The computation, without bpy: all stages that are not done, and their results read for the scene."""
+    """The computation, without bpy: all stages that are not done, or all if `restart`, and their results read for the scene."""
     from ...core.run import pipeline
     from ...core.run.engine import of_this_machine
     from ...core.run.take_run import open_run
     from ..scene.contents import read_contents
 
-    with open_run(take, out, overrides) as run:
+    with open_run(take, out, overrides, restart=restart) as run:
         if not pipeline.is_complete(run):
             run.engine = of_this_machine()
             pipeline.all_stages(run, monitor)
@@ -150,10 +150,7 @@ def open_sample(take: Path, again: bool, monitor: Monitor) -> "tuple[Path, TakeR
     if fitted and not again:
         monitor.begin("build")
         return take, run, read_contents(out, monitor)
-    if fitted:
-        with open_run(take, out, restart=True) as run:
-            run.results.remove("run.json")
-    return take, *measure(take, out, {}, True, monitor)
+    return take, *measure(take, out, {}, True, monitor, restart=fitted)
 
 
 class Cancel(bpy.types.Operator):

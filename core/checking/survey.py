@@ -59,19 +59,25 @@ def survey(footage: Footage, monitor: Monitor) -> Survey:
     for t, frame in enumerate(frames):
         monitor.step("checking the footage", t, len(frames))
         images = [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
-        small = [_reduced(image) for image in images]
+        small = [reduced(image) for image in images]
         for k, image in enumerate(images):
             same = before and footage.number(k, frame) == footage.number(k, frames[t - 1])  # of a view with fewer images per second
-            energy = float(np.abs(small[k] - before[k]).mean()) if before and not same else np.nan
+            energy = motion_energy(before[k], small[k]) if before and not same else np.nan
             figures[:, k, t] = energy, small[k].std(), np.percentile(small[k], BRIGHT_PERCENTILE), (image[::4, ::4] >= WHITE).mean()
         before = small
     return Survey(frames=frames, energy=figures[0], spread=figures[1], bright=figures[2], white=figures[3])
 
 
-def _reduced(image: np.ndarray) -> np.ndarray:
+def reduced(image: np.ndarray) -> np.ndarray:
+    """An image (h, w), `WIDTH_PX` wide."""
     width = min(WIDTH_PX, image.shape[1])
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def motion_energy(before: np.ndarray, now: np.ndarray) -> float:
+    """How much moves between two `reduced` images of a view: their mean difference in grey values."""
+    return float(np.abs(now - before).mean())
 
 
 def picture_findings(figures: Survey, names: tuple[str, ...]) -> list[Finding]:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..body.motion import BodyFit
@@ -14,12 +13,10 @@ from ..body.skin.extremities import shape_with_ends
 from ..body.skin.fingers import shape_for_skin
 from ..body.skin.person_skin import REST, cage, read_skin
 from ..body.skin.posed import Poser, skins_in
-from ..body.skin.texture import TEXTURE
+from ..body.skin.texture import TEXTURE, halves, pixels_of, sampled
 from ..foundation.errors import InputError
 from ..geometry.raster import Raster
 from ..images.sequence import decoded
-
-MOST_REMAPPED = 30_000  # OpenCV's largest width of a map is 32,767
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -38,17 +35,12 @@ class Coloured:
     vertices_m: np.ndarray  # (V, 3)
     triangles: np.ndarray  # (F, 3)
     uv: np.ndarray  # (F, 3, 2)
-    bgr: np.ndarray  # (h, w, 3) uint8
+    bgr: np.ndarray  # (S, S, 3) uint8
 
     def colours(self, raster: Raster) -> np.ndarray:
         """The texture (N, 3) at the samples of a raster of the triangles."""
         weights = raster.pieces.weights(raster.piece, raster.xy_px)
-        h, w = self.bgr.shape[:2]
-        xy = np.einsum("nc,nck->nk", weights, self.uv[raster.triangle]) * [w, -h] + [-0.5, h - 0.5]
-        at = xy.astype(np.float32).reshape(1, -1, 2)
-        parts = [at[:, i : i + MOST_REMAPPED] for i in range(0, at.shape[1], MOST_REMAPPED)]
-        found = [cv2.remap(self.bgr, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0] for part in parts]
-        return np.concatenate(found) if found else np.zeros((0, 3), np.uint8)
+        return sampled(self.bgr, pixels_of(np.einsum("nc,nck->nk", weights, self.uv[raster.triangle]), len(self.bgr)))
 
 
 SkinAt = Callable[[np.ndarray], Mesh]  # of a pose (D,)
@@ -75,9 +67,9 @@ def coloured_skin(folder: Path, body: BodyFit, settings: SkinSettings) -> Colour
         skin, picture = read_skin(folder / REST, shape_for_skin(body.shape, settings)), decoded(folder / TEXTURE)
     except InputError:
         return None
-    triangles, uv = (np.concatenate([table[:, [0, 1, 2]], table[:, [0, 2, 3]]]) for table in (skin.faces, skin.uv))
-    bgr = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
-    return Coloured(vertices_m=skin.vertices_m, triangles=triangles, uv=uv, bgr=np.ascontiguousarray(bgr[:, :, :3]))
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.shape[0] != picture.shape[1]:
+        return None  # it was painted over, by something that does not keep its form
+    return Coloured(vertices_m=skin.vertices_m, triangles=halves(skin.faces), uv=halves(skin.uv), bgr=picture)
 
 
 def _of_metaballs(body: BodyFit, settings: SkinSettings) -> SkinAt | None:

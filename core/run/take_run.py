@@ -138,7 +138,7 @@ def open_run(
     keys = stage_keys(footage, settings, Path(out))
     with Results(out).opened() as results:
         if restart:
-            results.remove("clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
+            results.remove("run.json", "clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
         before = {} if restart else results.read_run()
         record = new_record(footage, settings)
         record["stages"] = kept = valid_stages(before, keys, ignore_contours=ignore_contours)

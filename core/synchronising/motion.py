@@ -1,24 +1,23 @@
 """When somebody moves in a view: which starts bring the motion of two recordings together.
 
-    E_n = rms(I_n − I_(n−1)) − q₀.₁                                                                        (1)
+    E_n = mean |I_n − I_(n−1)| − q₀.₁                                                                      (1)
     c(T) = Σ_t E_a(t) E_b(t − T) / √(Σ E_a² Σ E_b²)                                                        (2)
 
-I are small images, q₀.₁ is the tenth percentile of all images: where nobody moves, noise is left; E is not less than 0. The energies are
-brought to one grid of times, and c is largest where one view began T after the other: as they are, which finds motion that begins or
-ends, and without their means, which finds the rhythm of motion that never stops. From another side the same motion has another rhythm, so
-these are candidates, which the rays of moving points must confirm.
+I are reduced images (`checking.survey`), q₀.₁ is the tenth percentile of all images: where nobody moves, noise is left; E is not less than
+0. The energies are brought to one grid of times, and c is largest where one view began T after the other: as they are, which finds motion
+that begins or ends, and without their means, which finds the rhythm of motion that never stops. From another side the same motion has
+another rhythm, so these are candidates, which the rays of moving points must confirm.
 """
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
+from ..checking.survey import motion_energy, reduced
 from ..foundation.progress import Monitor
 from ..images.interlace import RowGrid
 from ..images.sequence import ImageSequence
 
-WIDTH_PX = 64  # of the small images
 QUIET = 0.1  # quantile (1)
 GRID_S = 1 / 60  # of the energies
 APART_S = 0.5  # of two candidates
@@ -36,11 +35,9 @@ def energy_of(sequence: ImageSequence, rows: RowGrid, monitor: Monitor) -> np.nd
     energy, before = np.zeros(max(sequence.count - 1, 0)), None
     for n in range(sequence.count):
         monitor.step("reading the motion", n, sequence.count)
-        image = rows.rows(sequence.read(n))
-        size = WIDTH_PX, max(1, round(WIDTH_PX * image.shape[0] / image.shape[1]))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        small = reduced(rows.rows(sequence.read(n)))
         if before is not None:
-            energy[n - 1] = np.sqrt(np.mean((small - before) ** 2))
+            energy[n - 1] = motion_energy(before, small)
         before = small
     return np.maximum(energy - np.quantile(energy, QUIET), 0.0) if len(energy) else energy
 

@@ -162,7 +162,7 @@ class _Lights:
     def timing(self, view: View, monitor: Monitor) -> ViewTiming | None:
         """The beginning of a view by the light; None where it does not change alike in it and the reference view."""
         a, a_clock = self._of(self._take.views[self._take.reference], monitor)
-        b, b_clock = self._of(replace(view, start_s=0.0, drift_ppm=0.0, offset_frames=0), monitor) if a else ((), a_clock)
+        b, b_clock = self._of(_unplaced(view), monitor) if a else ((), a_clock)
         lit = offset_by_light(a, b, _moments(a, a_clock), _moments(b, b_clock)) if b else None
         return None if lit is None else _timing(view, lit.offset_s, lit.sigma_s, 1e6 * lit.drift, "light")
 
@@ -185,7 +185,7 @@ class _Motions:
         """The beginning of a view that is `lost`, where the same motion is seen in it and the reference view, and the rays confirm it."""
         view = next(v for v in self._take.views if v.name == lost.view)
         a = self._of(self._take.views[self._take.reference], monitor)
-        b = self._of(replace(view, start_s=0.0, drift_ppm=0.0, offset_frames=0), monitor)
+        b = self._of(_unplaced(view), monitor)
         pair = replace(self._take, views=(self._take.views[self._take.reference], view), reference_view=reference.view)
         for offset_s in offsets_by_motion(a[0], b[0], a[1], b[1]):
             candidate = _timing(view, offset_s, MOTION_SIGMA_S, 0.0, "motion")
@@ -204,6 +204,11 @@ class _Motions:
             energy = energy_of(sequence, self._take.rows_at(0), monitor)
             self._found[view.name] = energy, np.array([clock.time_s(n + 0.5) for n in range(len(energy))])
         return self._found[view.name]
+
+
+def _unplaced(view: View) -> View:
+    """The view on its own clock: as if it had begun with the take."""
+    return replace(view, start_s=0.0, drift_ppm=0.0, offset_frames=0)
 
 
 def _timed(take: Take, view: View) -> tuple[ImageSequence, Clock]:
@@ -292,7 +297,7 @@ def _improved(take: Take, footage: Footage, timing: ViewTiming, offset: TimeOffs
         return replace(timing, method="", problem=f"{why}. {advice}")
     view = next(v for v in take.views if v.name == timing.view)
     before_s = timing.start_s if timing.found else _zero(view, rate)
-    method = timing.method if timing.method.endswith("rays") else f"{timing.method} and rays" if timing.found else "rays"
+    method = " and ".join(dict.fromkeys([*timing.method.split(" and "), "rays"])) if timing.found else "rays"
     return replace(timing, start_s=before_s + late_s, sigma_s=sigma_s, method=method, problem="")
 
 

@@ -106,19 +106,24 @@ def paint(camera: Camera, parts: Sequence[Part], noise: SolidNoise, behind: Laye
     hit.reshape(-1)[raster.sample[nearer]] = nearer
     pixel, outline = _inner_and_outline(hit, depth, scene.owner[raster.triangle])
     centre = np.stack([pixel % light.shape[1], pixel // light.shape[1]], axis=1)
-    light.reshape(-1)[pixel] = _reflected(scene, raster, hit[::SAMPLES, ::SAMPLES].ravel()[pixel], centre, noise)
+    within = hit[::SAMPLES, ::SAMPLES].ravel()[pixel]
     here = np.stack([plane.ravel()[outline] for plane in _planes(hit)], axis=1)
-    samples = np.repeat(light.reshape(-1, 1)[outline], SAMPLES**2, axis=1)
-    samples[here >= 0] = _reflected(scene, raster, here[here >= 0], raster.xy_px[here[here >= 0]], noise)
-    light.reshape(-1)[outline] = samples.mean(axis=1)
-    if all(material.tint is None for material in scene.materials):
-        return Layer(light=light, depth_m=depth, bgr=behind.bgr if behind is not None else None)
-    colours, owner = np.array([material.bgr for material in scene.materials], dtype=np.float32), scene.owner[raster.triangle]
-    bgr = np.ones((*light.shape, 3), np.float32) if behind is None or behind.bgr is None else behind.bgr.copy()
-    bgr.reshape(-1, 3)[pixel] = colours[owner[hit[::SAMPLES, ::SAMPLES].ravel()[pixel]]]
-    mixed = np.repeat(bgr.reshape(-1, 1, 3)[outline], SAMPLES**2, axis=1)
-    mixed[here >= 0] = colours[owner[here[here >= 0]]]
-    bgr.reshape(-1, 3)[outline] = mixed.mean(axis=1)
+    on_edge = here[here >= 0]
+
+    def put(plane: np.ndarray, inner: np.ndarray, edge: np.ndarray) -> None:
+        """Values of the inner pixels, and of the samples of parts on outlines, into a plane (H, W, …)."""
+        flat = plane.reshape(-1, *plane.shape[2:])
+        flat[pixel] = inner
+        samples = np.repeat(flat[outline][:, None], SAMPLES**2, axis=1)
+        samples[here >= 0] = edge
+        flat[outline] = samples.mean(axis=1)
+
+    put(light, _reflected(scene, raster, within, centre, noise), _reflected(scene, raster, on_edge, raster.xy_px[on_edge], noise))
+    bgr = behind.bgr if behind is not None else None
+    if any(material.tint for material in scene.materials):
+        bgr = np.ones((*light.shape, 3), np.float32) if bgr is None else bgr.copy()
+        colours = np.array([material.bgr for material in scene.materials], dtype=np.float32)[scene.owner[raster.triangle]]
+        put(bgr, colours[within], colours[on_edge])
     return Layer(light=light, depth_m=depth, bgr=bgr)
 
 

@@ -31,9 +31,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
     found = list[list[str]]()
 
-    def measure(take: Path, out: Path, *rest: Any) -> tuple[Any, None]:
-        found.append(sorted(path.name for path in out.iterdir()))
-        with open_run(take, out) as opened:
+    def measure(take: Path, out: Path, *rest: Any, restart: bool) -> tuple[Any, None]:
+        with open_run(take, out, restart=restart) as opened:
+            found.append(sorted(path.name for path in out.iterdir()))
             return opened, None
 
     monkeypatch.setattr(run, "measure", measure)

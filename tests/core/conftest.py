@@ -191,3 +191,22 @@ def sixty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sixty") / "take"
     make_arm_take(folder, ArmTakeSettings(width_px=224, frames=18, fps=60.0, interlaced="none", swing_s=0.8, noise=0.0))
     return folder
+
+
+@pytest.fixture
+def at_thirty(sixty: Path, tmp_path: Path) -> Callable[[Mapping[str, Sequence[int]]], Path]:
+    """A function that makes a take at 30 images per second, whose views show some of the images of `sixty`, by their numbers."""
+
+    def made(shown: Mapping[str, Sequence[int]]) -> Path:
+        folder = tmp_path / "take"
+        folder.mkdir()
+        (folder / "rig.toml").write_bytes((sixty / "rig.toml").read_bytes())
+        text = (sixty / "take.toml").read_text(encoding="utf-8").replace("fps = 60.0", "fps = 30.0")
+        (folder / "take.toml").write_text(text, encoding="utf-8")
+        for view, numbers in shown.items():
+            (folder / view).mkdir()
+            for i, n in enumerate(numbers):
+                (folder / view / f"{i:04d}.png").symlink_to(sixty / view / f"{n:04d}.png")
+        return folder
+
+    return made

@@ -111,7 +111,7 @@ class TextureBaker:
                 better = weight > self._least[piece][rows]
                 rows, weight = rows[better], weight[better]
                 free, xy = _unhidden(view.camera, places[rows], nearest[v])
-                self._keep(piece.start + rows[free], _sampled(view, xy), weight[free], v)
+                self._keep(piece.start + rows[free], sampled(view.rgb, xy), weight[free], v)
 
         in_threads(shown, equal_pieces(len(self.texel), TOGETHER, TOGETHER))
         on_cage = [self._grey(view, depth, posed[self._rows], normals[self._rows]) for view, depth in zip(views, nearest)]
@@ -149,7 +149,7 @@ class TextureBaker:
         """The grey value (M,) of vertices (M, 3) of the cage, NaN where a view does not show them."""
         grey, (rows, _) = np.full(len(places), np.nan), _facing(view.camera, places, normals)
         free, xy = _unhidden(view.camera, places[rows], depth)
-        grey[rows[free]] = _sampled(view, xy).mean(axis=1)
+        grey[rows[free]] = sampled(view.rgb, xy).mean(axis=1)
         return grey
 
     def _exposures(self) -> np.ndarray:
@@ -251,21 +251,29 @@ def _unhidden(camera: Camera, places: np.ndarray, depth: np.ndarray) -> tuple[np
     return rows, xy[rows]
 
 
-def _sampled(view: View, xy: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) at full-frame pixels (N, 2)."""
+def sampled(picture: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """The colours (N, 3) of a picture (h, w, 3) at its pixels (N, 2), of the same type."""
     at = np.ascontiguousarray(xy, dtype=np.float32)
     found = [
-        cv2.remap(view.rgb, part[:, None, 0], part[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        cv2.remap(picture, part[:, None, 0], part[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for part in (at[i : i + 30000] for i in range(0, len(at), 30000))  # of at most 32767 rows
     ]
-    return np.concatenate(found) if found else np.zeros((0, 3), dtype=np.float32)
+    return np.concatenate(found) if found else np.zeros((0, 3), dtype=picture.dtype)
+
+
+def halves(quads: np.ndarray) -> np.ndarray:
+    """What quads (F, 4, …) have at their corners as that of their triangles (2 F, 3, …)."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def pixels_of(uv: np.ndarray, size_px: int) -> np.ndarray:
+    """The pixels (…, 2) of a square picture at texture coordinates (…, 2), v upwards; pixel centres are at whole numbers."""
+    return np.asarray(uv * [size_px, -size_px] + [-0.5, size_px - 0.5])
 
 
 def _texels(skin: OneSkin, size_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The texels (N,) that the skin covers, row · S + column, the vertices (N, 3) around each, and their weights (N, 3)."""
-    triangles = np.concatenate([skin.faces[:, [0, 1, 2]], skin.faces[:, [0, 2, 3]]])
-    uv = np.concatenate([skin.uv[:, [0, 1, 2]], skin.uv[:, [0, 2, 3]]])
-    xy = uv * [size_px, -size_px] + [-0.5, size_px - 0.5]  # texel centres at whole numbers, v upwards
+    triangles, xy = halves(skin.faces), pixels_of(halves(skin.uv), size_px)
     owner = np.full((size_px, size_px), -1, dtype=np.int32)
     for t, place in enumerate(np.ascontiguousarray(np.rint(16 * xy), dtype=np.int32)):
         cv2.fillConvexPoly(owner, place, t, shift=4)

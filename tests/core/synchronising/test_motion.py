@@ -1,5 +1,6 @@
 """The beginning of views by the motion that they show: energies of known starts, and takes without sound."""
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -55,19 +56,10 @@ def test_the_energy_is_that_between_images(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def early(sixty: Path, tmp_path: Path) -> Path:
-    """Three views at 30 images per second; R began 150 still images before the others, too early for the rays alone."""
-    folder = tmp_path / "take"
-    folder.mkdir()
-    (folder / "rig.toml").write_bytes((sixty / "rig.toml").read_bytes())
-    text = (sixty / "take.toml").read_text(encoding="utf-8").replace("fps = 60.0", "fps = 30.0")
-    (folder / "take.toml").write_text(text, encoding="utf-8")
-    for view in "LCR":
-        (folder / view).mkdir()
-        shown = [*([0] * 150 if view == "R" else [0] * 12), *range(0, 18, 2), *([16] * 12)]
-        for i, n in enumerate(shown):
-            (folder / view / f"{i:04d}.png").symlink_to(sixty / view / f"{n:04d}.png")
-    return folder
+def early(at_thirty: Callable[[Mapping[str, Sequence[int]]], Path]) -> Path:
+    """Three views at 30 images per second; R began 138 still images before the others, too early for the rays alone."""
+    moving = [*range(0, 18, 2), *([16] * 12)]
+    return at_thirty({"L": [0] * 12 + moving, "C": [0] * 12 + moving, "R": [0] * 150 + moving})
 
 
 def test_a_view_that_began_much_earlier_is_found_without_sound(early: Path) -> None:

@@ -3,6 +3,7 @@
 import re
 import struct
 import wave
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,18 +106,9 @@ def test_damaged_wav_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def loose(sixty: Path, tmp_path: Path) -> Path:
+def loose(at_thirty: Callable[[Mapping[str, Sequence[int]]], Path]) -> Path:
     """Three views at 30 images per second, of which R began half an image interval late; take.toml does not say so."""
-    folder = tmp_path / "take"
-    folder.mkdir()
-    (folder / "rig.toml").write_bytes((sixty / "rig.toml").read_bytes())
-    text = (sixty / "take.toml").read_text(encoding="utf-8").replace("fps = 60.0", "fps = 30.0")
-    (folder / "take.toml").write_text(text, encoding="utf-8")
-    for view, first in (("L", 0), ("C", 0), ("R", 1)):
-        (folder / view).mkdir()
-        for i, n in enumerate(range(first, 18, 2)):
-            (folder / view / f"{i:04d}.png").symlink_to(sixty / view / f"{n:04d}.png")
-    return folder
+    return at_thirty({"L": range(0, 18, 2), "C": range(0, 18, 2), "R": range(1, 18, 2)})
 
 
 def test_sound_then_rays_give_the_start_of_a_view_half_a_frame_late(loose: Path, capsys: Capture) -> None:

@@ -1,5 +1,6 @@
 """Views with their own images per second, start, drift and time stamps: which image shows a frame, and the rest that is interpolated."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from tricap.core.take.clock import Clock, read_timestamps
 from tricap.core.take.footage import Footage, open_take
 from tricap.core.take.take import FrameClicks, Take, View, read_take
 
+AtThirty = Callable[[Mapping[str, Sequence[int]]], Path]
 HEAD = 'format = "tricap-take"\nversion = 1\nfps = 30.0\n'
 
 
@@ -53,8 +55,8 @@ def test_time_stamps_of_one_or_several_views_are_read_in_the_order_of_the_images
         ("time_s,\0x\n\0", "Cannot read|no time stamps|not a number"),
     ],
 )
-def test_time_stamps_that_cannot_be_used_are_refused_in_one_sentence(sixty: Path, tmp_path: Path, text: str, said: str) -> None:
-    take = loose(sixty, tmp_path / "take", {"L": range(3), "C": range(3), "R": range(3)})
+def test_time_stamps_that_cannot_be_used_are_refused_in_one_sentence(at_thirty: AtThirty, text: str, said: str) -> None:
+    take = loose(at_thirty, {"L": range(3), "C": range(3), "R": range(3)})
     (take.folder / "t.csv").write_text(text)
     with pytest.raises(InputError, match=said) as refused:
         open_take(replace(take, views=(replace(take.views[0], timestamps="t.csv"), *take.views[1:])))
@@ -70,24 +72,18 @@ def test_impossible_clocks_are_refused(tmp_path: Path, line: str) -> None:
         read_take(tmp_path)
 
 
-def loose(sixty: Path, folder: Path, images: dict[str, range]) -> Take:
+def loose(at_thirty: AtThirty, images: dict[str, range]) -> Take:
     """The same, of which the views have some images each, at 30 frames per second."""
-    folder.mkdir()
-    (folder / "rig.toml").write_bytes((sixty / "rig.toml").read_bytes())
-    for view, numbers in images.items():
-        (folder / view).mkdir()
-        for i, n in enumerate(numbers):
-            (folder / view / f"{i:04d}.png").symlink_to(sixty / view / f"{n:04d}.png")
-    return replace(read_take(sixty), folder=folder, rig_path=folder / "rig.toml", fps=30.0, clicks=FrameClicks())
+    return replace(read_take(at_thirty(images)), clicks=FrameClicks())
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(np.mean((a - b) ** 2)))
 
 
-def test_views_at_other_rates_show_the_instants_of_the_take(sixty: Path, tmp_path: Path) -> None:
+def test_views_at_other_rates_show_the_instants_of_the_take(at_thirty: AtThirty, sixty: Path) -> None:
     """L has 60 images per second and starts 2 of them late, R has 30, half a frame late: R is interpolated to the instants."""
-    take = loose(sixty, tmp_path / "take", {"L": range(2, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
+    take = loose(at_thirty, {"L": range(2, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
     views = tuple(replace(v, **clock) for v, clock in zip(take.views, ({"fps": 60.0, "start_s": 2 / 60}, {}, {"start_s": 1 / 60})))
     footage = open_take(replace(take, views=views))
     assert footage.frames == range(1, 9)
@@ -103,8 +99,8 @@ def test_views_at_other_rates_show_the_instants_of_the_take(sixty: Path, tmp_pat
     assert list(footage.frames_of_images(0, np.array([0, 1, 2]))) == [1, -1, 2]
 
 
-def test_how_far_images_stray_when_they_are_played_one_after_another(sixty: Path, tmp_path: Path) -> None:
-    take = loose(sixty, tmp_path / "take", {"L": range(18), "C": range(9), "R": range(9)})
+def test_how_far_images_stray_when_they_are_played_one_after_another(at_thirty: AtThirty) -> None:
+    take = loose(at_thirty, {"L": range(18), "C": range(9), "R": range(9)})
     steady = "view,time_s\n" + "".join(f"R,{n / 30}\n" for n in range(9))
     for times, strays in ((steady, 0.0), (steady.replace("R,0.0\n", "R,-0.1\n"), 3.0)):  # three frames are missing after image 0
         (take.folder / "timestamps.csv").write_text(times)
@@ -123,9 +119,9 @@ def test_keys_of_stages_follow_clocks(sixty: Path, tmp_path: Path) -> None:
     assert len(keys) == 3
 
 
-def test_the_rays_give_what_a_clock_lacks(sixty: Path, tmp_path: Path) -> None:
+def test_the_rays_give_what_a_clock_lacks(at_thirty: AtThirty) -> None:
     """L at 60, R at 30 images per second half a frame late, but its start is given 6 ms too early."""
-    take = loose(sixty, tmp_path / "take", {"L": range(0, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
+    take = loose(at_thirty, {"L": range(0, 18), "C": range(0, 18, 2), "R": range(1, 18, 2)})
     for wrong_s in (0.0, 0.006):
         views = tuple(replace(v, **c) for v, c in zip(take.views, ({"fps": 60.0}, {}, {"start_s": 1 / 60 - wrong_s})))
         offsets = {o.view: o for o in estimate_offsets(open_take(replace(take, views=views)), Monitor())}
