@@ -9,8 +9,12 @@ LEAST_MB = 800  # of memory: below, OpenBLAS may end the process, which nothing 
 def _leave_out_working_folder() -> None:
     """`python -m` looks for modules in the working folder first; neither this process nor its children load any from there."""
     os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        working = os.getcwd()
+    except OSError:  # it was deleted
+        working = ""
     here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    if sys.path and sys.path[0] in ("", os.getcwd()) and os.getcwd() != here:
+    if sys.path and sys.path[0] in ("", working) and working != here:
         del sys.path[0]
 
 
@@ -38,9 +42,12 @@ def main(argv: list[str] | None = None) -> int:
         with streams.robust():
             streams.write_line(f"tricap: {too_little}", sys.stderr)
         return 2
-    from .addon import command
+    try:
+        from .addon import command
 
-    return command.main(argv)
+        return command.main(argv)
+    except KeyboardInterrupt:  # before the command has begun, or a second Ctrl-C
+        return 130
 
 
 if __name__ == "__main__":

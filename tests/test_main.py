@@ -90,3 +90,19 @@ def test_importing_the_package_loads_nothing_of_blender() -> None:
     )
     assert done.stdout.strip() == "[]", done.stderr
     assert callable(tricap.register) and callable(tricap.unregister)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a working folder cannot be deleted on Windows")
+def test_a_working_folder_that_was_deleted_does_not_matter(tmp_path: Path) -> None:
+    code = f"import os; os.mkdir({str(tmp_path / 'g')!r}); os.chdir({str(tmp_path / 'g')!r}); os.rmdir({str(tmp_path / 'g')!r}); "
+    code += f"from tricap.__main__ import main; raise SystemExit(main(['check', {str(tmp_path / 'none')!r}]))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_an_early_interruption_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(argv: list[str] | None) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tricap.addon.command.main", interrupted)
+    assert main(["check", "x"]) == 130

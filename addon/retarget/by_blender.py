@@ -6,6 +6,7 @@ its armature and its header, because game engines handle scaled armature objects
 is always in metres. Axes: FBX and USD use those of the program, glTF and Alembic are always Y up.
 """
 
+import errno
 import os
 import shutil
 import tempfile
@@ -19,6 +20,7 @@ import bpy
 from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
+from ...core.cli.streams import unheard
 from ...core.foundation import store
 from ...core.foundation.bounded import check_name, real_place
 from ...core.foundation.errors import InputError
@@ -34,6 +36,7 @@ from .programs import Program, bone_names
 FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
 UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
 NO_MESHES = "Alembic stores meshes, and this motion has none; choose fbx, glb or usd."
+LEAST_FREE_MB, LEFT_MB = 32, 1  # of the disk: before an export, and after it; USD and Alembic do not notice that it is full
 TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "images", "collections")
 
 
@@ -129,16 +132,26 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     part = store.part_of(file)
     try:
         store.try_writing(part)
-        export(str(part))
+        _check_free(part.parent, LEAST_FREE_MB)
+        with unheard() if bpy.app.background else nullcontext():
+            export(str(part))
+        _check_free(part.parent, LEFT_MB)
         if not part.is_file():
             raise InputError(f"Blender wrote nothing to {file}; choose another folder.")
         os.replace(part, file)
     except (OSError, RuntimeError, shutil.Error) as error:
-        reason = getattr(error, "strerror", None) or str(error).strip()[:200]
+        said = str(error).strip() or "the exporter failed"
+        reason = getattr(error, "strerror", None) or said.splitlines()[-1][:200]  # of a traceback, the last line
         raise InputError(f"Cannot write {file}: {reason}. Choose another name or folder, or free some space.") from error
     finally:
         if part.exists():
             part.unlink()
+
+
+def _check_free(folder: Path, megabytes: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < megabytes << 20:
+        raise OSError(errno.ENOSPC, f"{free >> 10} kB are left on the disk, {megabytes} MB are needed")
 
 
 def _fbx(path: str, program: Program) -> None:

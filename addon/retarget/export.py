@@ -19,8 +19,9 @@ from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from ...core.motion.tables import read_joints
-from ...core.results.folder import check_not_result
+from ...core.results.folder import check_not_result, lost
 from ...core.results.outputs import check_output
+from ...core.results.run_json import read_run
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
@@ -68,6 +69,7 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
         from .read import ended
 
         return ended(exporting_played(open_moving(out), kind, file, preset, monitor))
+    _check_complete(out, of if kind == "ply" else "")
     if kind == "ply":
         return _copy_ply(out, file, of)
     if kind in POINTS:
@@ -79,6 +81,18 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     from .by_blender import export_motion
 
     return export_motion(kind, out, file, program, motion)
+
+
+def _check_complete(out: Path, of: str) -> None:
+    """Check that the results in a folder are those that its run wrote; `of`: the folder of them that is exported.
+
+    Raises:
+        InputError: some are missing or cut.
+    """
+    run = read_run(out / "run.json") if (out / "run.json").is_file() else {}
+    for stage, names in lost(out, run).items():
+        if of in names or (stage == "fit" and of in ("", "skin")):
+            raise InputError(f"{', '.join(names)} in {out} is missing, cut, or lacks files; repeat the run, which makes it again.")
 
 
 def exporting_played(armature_object: Any, kind: str, file: Path, preset: str, monitor: Monitor) -> Generator[None, None, str]:

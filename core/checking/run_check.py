@@ -21,6 +21,7 @@ from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..motion.formats.ply import read_ply
 from ..motion.tables import JointTable, MotionTable, read_joints, read_motion
+from ..results.folder import lost
 from ..results.run_json import read_run
 from .findings import Cause, Checked, Finding, doubtful, wrong
 
@@ -33,7 +34,7 @@ RAYS_PX = 1.0  # distance between the rays of matched points
 NEAR_M = 0.12  # distance from a bone within which points belong to its limb
 FEWEST_ON_LIMB = 30  # points
 MOST_LISTED = 8  # frames
-MADE_BY = {"measure": ("clouds",), "track": ("trajectories.npz",), "fit": ("body.toml", "joints.csv", "motion.csv"), "report": ("report",)}
+NEEDED = {"measure": ("clouds",), "track": ("trajectories.npz",), "fit": ("body.toml", "joints.csv", "motion.csv"), "report": ("report",)}
 
 
 def check_run(folder: Path, monitor: Monitor) -> Checked:
@@ -79,12 +80,17 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
     findings, again = [], "Run the same command again; it resumes there."
     if "measure" not in run["stages"]:
         return [wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
-    for stage, files in MADE_BY.items():
+    incomplete = lost(folder, run)
+    for stage, files in NEEDED.items():
         if "not_done" in run["stages"].get(stage, {}) or stage not in run["stages"]:
             continue
         gone = [name for name in files if not (folder / name).exists()]
+        less = [name for name in incomplete.get(stage, []) if name not in gone]
         if gone:
             findings.append(wrong(Cause.FILES_MISSING, f"{', '.join(gone)} of the stage “{stage}” is missing in {folder}.", again))
+        if less:
+            sentence = f"{', '.join(less)} of the stage “{stage}” in {folder} is missing, cut, or lacks files."
+            findings.append(wrong(Cause.FILES_MISSING, sentence, again))
     return findings
 
 

@@ -9,7 +9,7 @@ import errno
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ..foundation.errors import InputError
@@ -57,6 +57,33 @@ def robust() -> Iterator[None]:
                 _give_up(stream)
         for stream, errors in before:
             stream.reconfigure(errors=errors)
+
+
+@contextmanager
+def unheard() -> Iterator[None]:
+    """What libraries print goes nowhere: what matters is said afterwards, and a stream that is full or closed would end them."""
+    numbers = [number for number in (1, 2) if _is_open(number)]
+    kept, nowhere = [os.dup(number) for number in numbers], os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in numbers:
+            os.dup2(nowhere, number)
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        for number, before in zip(numbers, kept):
+            os.dup2(before, number)
+            os.close(before)
+        os.close(nowhere)
+
+
+def _is_open(number: int) -> bool:
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
 
 
 def write_line(text: str, stream: Any) -> None:

@@ -24,6 +24,14 @@ RESULTS = (  # files and folders that a run replaces
     "scene.mp4", "body.blend",
 )  # fmt: skip
 
+MADE_BY = {  # what of them the stages write, and others need
+    "measure": ("clouds",),
+    "track": ("trajectories.npz", "trajectories_raw.npz", "tracked"),
+    "fit": ("joints.csv", "motion.csv", "body.toml", "frames.csv", "skin"),
+    "report": ("report/report.html",),
+}
+COUNTED = (".ply", ".npz", ".png")  # files of a folder that a run writes; others, such as a system's thumbnails, do not matter
+
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
 PARENTS = ("cache", FIELDS)  # whose folders are written to
 WRITTEN = (
@@ -161,8 +169,9 @@ class Results:
         return run_json.read_run(path) if path.exists() else {}
 
     def write_run(self, run: Mapping[str, Any]) -> None:
-        """run.json"""
-        store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
+        """run.json, with the number and the bytes of the files as they are now."""
+        files = {name: size for names in MADE_BY.values() for name in names if (size := _size(self.path(name)))[0]}
+        store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run, "files": files})
 
 
 class FitCheckpoints:
@@ -178,6 +187,24 @@ class FitCheckpoints:
     def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a checkpoint, in place of an earlier one of this name."""
         self._results.save_checkpoint(self._folder, name, self._key, arrays)
+
+
+def lost(folder: Path, run: Mapping[str, Any]) -> dict[str, list[str]]:
+    """By stage, the results in a folder that have fewer files or bytes than when run.json was written (that of an earlier version does not
+    know)."""
+    then, found = run.get("files", {}), dict[str, list[str]]()
+    for stage, names in MADE_BY.items():
+        fewer = [name for name in names if name in then and any(now < was for now, was in zip(_size(folder / name), then[name]))]
+        if fewer:
+            found[stage] = fewer
+    return found
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """The number of files that a result has, and their bytes."""
+    files = path.iterdir() if path.is_dir() else [path]
+    sizes = [p.stat().st_size for p in files if p.is_file() and (p == path or (p.suffix in COUNTED and not p.name.startswith(".")))]
+    return len(sizes), sum(sizes)
 
 
 def _written(folder: Path) -> list[Path]:

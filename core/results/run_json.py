@@ -10,7 +10,7 @@ from ..foundation.errors import InputError
 FORMAT, VERSION = "tricap-run", 1
 FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
-    "reference_note": str,
+    "reference_note": str, "files": dict,
 }  # fmt: skip
 STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),
@@ -56,6 +56,9 @@ def _invalid_table(run: Mapping[str, Any]) -> str | None:
     frames = run.get("frames", [0, 0])
     if len(frames) != 2 or any(type(f) is not int for f in frames) or not 0 <= frames[1] - frames[0]:
         return "frames"
+    sizes = run.get("files", {}).values()
+    if any(not isinstance(size, list) or len(size) != 2 or any(type(n) is not int for n in size) for size in sizes):
+        return "files"
     texts = {"inputs": run.get("inputs", {}).values(), "warnings": run.get("warnings", []), "views": run.get("views", [])}
     return next((name for name, values in texts.items() if any(not isinstance(v, str) for v in values)), None)
 

@@ -14,7 +14,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
-from ..results.folder import Results, check_separate_folder
+from ..results.folder import Results, check_separate_folder, lost
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
 from ..surface.resolution import measured_footage
@@ -141,7 +141,8 @@ def open_run(
             results.remove("run.json", "clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
         before = {} if restart else results.read_run()
         record = new_record(footage, settings)
-        record["stages"] = kept = valid_stages(before, keys, ignore_contours=ignore_contours)
+        kept, incomplete = valid_stages(before, keys, ignore_contours=ignore_contours), lost(results.folder, before)
+        record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
         if before:  # what was made otherwise must not stand beside the new
             results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
         yield Run(footage=footage, settings=settings, results=results, keys=keys, record=record, pictured=pictures)

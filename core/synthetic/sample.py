@@ -39,6 +39,7 @@ def pack(archive: Path, folder: Path) -> None:
     """Pack a recording and its results, from which the report is removed."""
     record = _placed(read_run(folder / RESULTS / "run.json"), str(bounded.real_path(folder)), PLACE)
     record["stages"].pop("report")  # it is as large as all else
+    record.pop("files")  # some of them are left out
     store.write_json(folder / RESULTS / "run.json", record)
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     content = io.BytesIO()

@@ -1,7 +1,11 @@
 """Exports read back by readers that are not ours: Blender's importers."""
 
+import json
+import os
+import shutil
+import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import matrix_from_euler, shortest
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
+from tricap.core.results.folder import Results
 
 from .conftest import SmallRun
 
@@ -146,3 +151,54 @@ def test_a_file_whose_name_is_no_text_is_not_given_to_blender(empty: ModuleType,
     with pytest.raises(InputError, match="is not UTF-8; rename it"):
         write_whole(tmp_path / "a\udcff.fbx", lambda part: pytest.fail("the exporter was called"))
     assert not list(tmp_path.iterdir())
+
+
+def test_results_that_are_gone_are_not_left_out_in_silence(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    out = small_run.out
+    Results(out).write_run(json.loads((out / "run.json").read_text()))
+    shutil.rmtree(out / "skin")
+    for kind in ("fbx", "bvh", "ply"):
+        with pytest.raises(InputError, match="^skin in .* is missing, cut, or lacks files; repeat the run"):
+            export_file(out, kind, tmp_path / f"a.{kind}", "plain", Monitor())
+    assert "files from clouds/" in export_file(out, "ply", tmp_path / "ply", "plain", Monitor(), of="clouds")
+
+
+def test_a_full_disk_is_noticed_before_and_after(empty: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """USD and Alembic end as if all were well, with a part of the file."""
+    from tricap.addon.retarget import by_blender
+
+    left = [100 << 20]
+    monkeypatch.setattr(by_blender.shutil, "disk_usage", lambda folder: SimpleNamespace(free=left[0]))
+
+    def export(part: str) -> None:
+        Path(part).write_text("half of")
+        left[0] = 0
+
+    with pytest.raises(InputError, match="a.usd: 0 kB are left on the disk"):
+        by_blender.write_whole(tmp_path / "a.usd", export)
+    with pytest.raises(InputError, match="32 MB are needed"):
+        by_blender.write_whole(tmp_path / "a.usd", lambda part: pytest.fail("the exporter was called"))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has /dev/full")
+def test_exporters_do_not_print_into_full_streams(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.retarget.by_blender import write_whole
+
+    def export(part: str) -> None:
+        os.write(1, b"libraries print"), os.write(2, b"and complain")
+        print("so do add-ons", file=sys.stderr, flush=True)
+        Path(part).write_text("motion")
+
+    full, kept = os.open("/dev/full", os.O_WRONLY), [os.dup(n) for n in (1, 2)]
+    try:
+        os.dup2(full, 1), os.dup2(full, 2)
+        write_whole(tmp_path / "a.usd", export)
+        with pytest.raises(OSError, match="No space"):
+            os.write(2, b"afterwards they are as before")
+    finally:
+        for n, before in zip((1, 2), kept):
+            os.dup2(before, n)
+            os.close(before)
+        os.close(full)
+    assert (tmp_path / "a.usd").read_text() == "motion"

@@ -19,6 +19,7 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.motion.formats.ply import read_ply, write_cloud
 from tricap.core.run import pipeline
+from tricap.core.run.take_run import open_run
 from tricap.core.synthetic.arm import arm_rig
 
 CAMERAS = arm_rig(768).cameras
@@ -100,6 +101,10 @@ def file_gone(folder: Path) -> None:
     (folder / "out" / "motion.csv").unlink()
 
 
+def skin_gone(folder: Path) -> None:
+    shutil.rmtree(folder / "out" / "skin")
+
+
 def take_changed(folder: Path) -> None:
     with open(folder / "take" / "take.toml", "a") as file:
         file.write("# another thought\n")
@@ -153,8 +158,9 @@ def damaged(folder: Path) -> None:
     (folder / "out" / "run.json").write_text('{"format": "tricap-run", "stages": 3}')
 
 
-RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "files missing", take_changed: "stale result",
-           thin: "coverage", unsure: "large sigma", bare_forearm: "coverage", unsure_angle: "large sigma", warned: "warning",
+RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "files missing", skin_gone: "files missing",
+           take_changed: "stale result", thin: "coverage", unsure: "large sigma", bare_forearm: "coverage",
+           unsure_angle: "large sigma", warned: "warning",
            rays: "rays miss", damaged: "input"}  # fmt: skip
 
 
@@ -174,6 +180,19 @@ def test_a_fault_of_a_result_is_named(fault: Callable[[Path], None], finished: P
     sound = {f.sentence for f in check_run(finished / "out", Monitor()).findings}
     new = [f for f in check_run(tmp_path / "run" / "out", Monitor()).findings if f.sentence not in sound]
     assert RESULTS[fault] in {f.cause for f in new}, new
+
+
+@pytest.mark.slow
+def test_a_run_makes_again_what_is_gone_or_cut(finished: Path, tmp_path: Path) -> None:
+    again = {"growing": {"spacing_px": 6}, "skin": {"texture_px": 64}}
+    for spoil in (lambda out: (out / "clouds" / "0001.ply").unlink(), lambda out: (out / "joints.csv").write_bytes(b"frame,")):
+        out = Path(shutil.copytree(finished / "out", tmp_path / "out", dirs_exist_ok=True))
+        spoil(out)
+        with open_run(finished / "take", out, again, (0, 5)) as job:
+            assert not pipeline.is_complete(job)
+        pipeline.run(finished / "take", out, again, frames=(0, 5))
+        for name in ("clouds/0001.ply", "joints.csv"):
+            assert (out / name).read_bytes() == (finished / "out" / name).read_bytes()
 
 
 def test_views_from_too_far_apart_are_found():

@@ -8,7 +8,7 @@ import pytest
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import read_ply
-from tricap.core.results.folder import Results
+from tricap.core.results.folder import Results, lost
 from tricap.core.surface.cloud import PointCloud, write_cloud
 from tricap.core.tracking.trajectories import Filtered, Trajectories, write_trajectories
 
@@ -65,7 +65,7 @@ def test_run_json(tmp_path: Path) -> None:
     results = Results(tmp_path)
     assert results.read_run() == {}
     results.write_run({"fps": 25.0, "sigma0": float("nan"), "name": "é"})
-    assert results.read_run() == {"format": "tricap-run", "version": 1, "fps": 25.0, "sigma0": None, "name": "é"}
+    assert results.read_run() == {"format": "tricap-run", "version": 1, "fps": 25.0, "sigma0": None, "name": "é", "files": {}}
     for content, said in (("{", "is not a JSON file"), ("[]", "was not written by"), ('{"format": "x"}', "was not written by")):
         (tmp_path / "run.json").write_text(content)
         with pytest.raises(InputError, match=said):
@@ -120,3 +120,27 @@ def test_removing(tmp_path: Path) -> None:
     (tmp_path / "body.toml").write_text("x")
     results.remove("body.toml", "cache", "missing")
     assert not any(tmp_path.iterdir())
+
+
+def test_what_was_written_and_is_gone_or_cut_is_known(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    for name in ("clouds/0000.ply", "clouds/0001.ply", "joints.csv", "skin/rest.npz", "skin/texture.png", "report/report.html"):
+        store.write_bytes(tmp_path / name, b"some bytes")
+    results.write_run({"stages": {}})
+    run = results.read_run()
+    assert (
+        run["files"] == {"clouds": [2, 20], "joints.csv": [1, 10], "skin": [2, 20], "report/report.html": [1, 10]}
+        and lost(tmp_path, run) == {}
+    )
+    (tmp_path / "clouds" / "Thumbs.db").write_bytes(b"of the system")
+    (tmp_path / "skin" / ".DS_Store.png").write_bytes(b"of the system")
+    (tmp_path / "clouds" / "0002.ply").write_bytes(b"more harms nothing")
+    assert lost(tmp_path, run) == {} and lost(tmp_path, {"stages": {}}) == {}, "and an earlier version does not know"
+    (tmp_path / "joints.csv").write_bytes(b"cut")
+    (tmp_path / "skin" / "texture.png").unlink()
+    (tmp_path / "report" / "report.html").unlink()
+    assert lost(tmp_path, run) == {"fit": ["joints.csv", "skin"], "report": ["report/report.html"]}
+    for size in (3, [1], ["1", 2], [1, 2.5]):
+        store.write_json(tmp_path / "run.json", {**run, "files": {"clouds": size}})
+        with pytest.raises(InputError, match="“files” is invalid"):
+            results.read_run()
