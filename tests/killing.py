@@ -254,7 +254,8 @@ def _count_operations(say: int, moment: Moment | None) -> None:
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    """Every file of OUT by name, without what tells the time: seconds in run.json and the page; of a .blend only that it is there."""
+    """Every file of OUT by name, without what tells the time: seconds in run.json and the page, and so the page's bytes; of a .blend only
+    that it is there."""
     found = {}
     for path in sorted(p for p in out.rglob("*") if p.is_file()):
         name, data = path.relative_to(out).as_posix(), path.read_bytes()
@@ -262,6 +263,7 @@ def contents(out: Path) -> dict[str, bytes]:
             run = json.loads(data)
             for stage in run["stages"].values():
                 stage.pop("seconds")
+            run.get("files", {}).pop("report/report.html", None)
             data = json.dumps(run).encode()
         elif name.startswith("report/") and path.suffix in (".html", ".json"):
             data = re.sub(rb'("?seconds"?: *)[0-9.e+-]+', rb"\1", data)

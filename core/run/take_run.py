@@ -14,7 +14,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
-from ..results.folder import Results, check_separate_folder, lost
+from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
 from ..surface.resolution import measured_footage
@@ -72,7 +72,8 @@ class Run:
     def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
-        self.record["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
+        stages = self.record["stages"] | {stage: {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}}
+        self.record["stages"] = {name: stages[name] for name in MADE_BY if name in stages}  # one made again is no longer the last
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
         self.results.write_run(self.record)
 

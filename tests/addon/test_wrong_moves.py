@@ -163,14 +163,14 @@ def test_esc(
     """At each stage: a warning, the scene as it was, and the next run goes on to the same numbers."""
     jobs = importlib.import_module(f"{ADDON}.jobs")
 
-    class Stopped(jobs.Monitor):  # type: ignore[misc,name-defined]
+    class Stopped(jobs.WaitingMonitor):  # type: ignore[misc,name-defined]
         def step(self, name: str, done: float, total: float) -> None:
             if name == stage:
                 self.cancel()
             super().step(name, done, total)
 
     with monkeypatch.context() as patch:
-        patch.setattr(jobs, "Monitor", Stopped)
+        patch.setattr(jobs, "WaitingMonitor", Stopped)
         before = sorted(scene.data.objects.keys())
         assert run(scene, take, take.with_name("results"))() == {"CANCELLED"}
         assert sorted(scene.data.objects.keys()) == before
