@@ -205,6 +205,10 @@ def sidebar(kind: str, tab: str) -> Iterator[None]:
     yield from settle()
     region_of(area, "UI").active_panel_category = tab
     yield from settle()
+    if kind == "CLIP_EDITOR" and bpy.app.version < (5, 0):  # it leaves the footage where the sidebar is now
+        yield from move(area.x + 40, middle(area)[1])
+        yield from key("HOME")
+        yield from settle()
     yield from move(region_of(area, "UI").x + 60, middle(area)[1])
     yield from settle()
     return area
