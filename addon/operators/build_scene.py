@@ -171,15 +171,16 @@ def _views(context: bpy.types.Context) -> list[bpy.types.RegionView3D]:
     return [area.spaces.active.region_3d for area in areas if area.type == "VIEW_3D"]
 
 
-def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, thing: bpy.types.Object, *, front: bool = False) -> None:
-    """Frame a body or a picture in the 3-D views, without the objects of Blender's startup file, and its frames in the timelines. With
+def frame_in_views(operator: bpy.types.Operator, context: bpy.types.Context, *things: bpy.types.Object, front: bool = False) -> None:
+    """Frame bodies or a picture in the 3-D views, without the objects of Blender's startup file, and its frames in the timelines. With
     `front`, it is seen from the front."""
     if context.window is None or bpy.app.background:
         return
     hide_default_objects(operator, context)
     for item in context.selected_objects:
         item.select_set(False)
-    thing.select_set(True)
+    for thing in things:
+        thing.select_set(True)
     for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
         region, shading = next(r for r in area.regions if r.type == "WINDOW"), area.spaces.active.shading
         if shading.color_type == "MATERIAL":  # Blender's own choice

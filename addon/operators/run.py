@@ -12,7 +12,7 @@ from ...core.foundation.progress import Monitor
 from .. import folders, project
 from ..jobs import JobOperator
 from ..session import get_session
-from .build_scene import RELATIVE, put_into_scene
+from .build_scene import RELATIVE, frame_in_views, put_into_scene
 from .stages import StageOperator, read_if_it_fails, report_run
 
 if TYPE_CHECKING:
@@ -108,8 +108,22 @@ class SampleOperator(JobOperator):
         context.scene.tricap.out = folders.for_user(take / project.RESULTS)
         if contents is not None:
             put_into_scene(self, context, contents)
+            add_follower(self, context)
         report_run(self, context, run)
         return {"FINISHED"}
+
+
+def add_follower(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Beside the sample's body, the first time, a robot that moves like it."""
+    from ..retarget.robot import NAME, add_robot, follow
+    from ..scene import armature
+
+    if NAME in bpy.data.objects:
+        return
+    body, target = bpy.data.objects[armature.NAME], add_robot(context)
+    follow(target, body)
+    context.scene.tricap_retarget.target = target
+    frame_in_views(operator, context, body, target)
 
 
 class LoadSample(SampleOperator, bpy.types.Operator):

@@ -2,9 +2,9 @@
 
 
 def _classes() -> tuple[type, ...]:
-    from . import map_operators, operators, panel
+    from . import map_operators, operators, panel, robot
 
-    return (*operators.CLASSES, *map_operators.CLASSES, *panel.CLASSES)
+    return (*operators.CLASSES, *map_operators.CLASSES, *robot.CLASSES, *panel.CLASSES)
 
 
 def register() -> None:

@@ -66,7 +66,8 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     if target is not None and props.target is None:
         sentence(layout, context, f"“{target.name}” is the target, as the only other armature.", "INFO")
     if target is None:
-        sentence(layout, context, "Add your character to this scene, and choose its armature as the target.", "INFO")
+        sentence(layout, context, "Add your character to this scene, and choose its armature as the target. To try it without one:", "INFO")
+        layout.operator("tricap.add_robot", icon="OUTLINER_OB_ARMATURE")
     header, body = layout.panel("tricap_retarget_map", default_closed=not props.rows)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (automatic)")
     if body is not None:

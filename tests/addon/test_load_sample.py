@@ -47,9 +47,17 @@ def test_a_finished_project_is_opened_beside_the_file(blender: ModuleType, saved
     assert blender.data.objects["Body"].animation_data.action is not None and scene.camera is not None
     (colours,) = [image for image in blender.data.images if tuple(image.size) == (640, 640)]
     assert colours.packed_file and len(blender.data.objects["Skin"].data.polygons) > 10_000
+    robot, body = blender.data.objects["Robot"], blender.data.objects["Body"]
+    for frame in (scene.frame_start, scene.frame_end):
+        scene.frame_set(frame)
+        for name in ("forearm.L", "thigh.R"):
+            ours, theirs = (np.array(thing.matrix_world @ thing.pose.bones[name].matrix)[:3, 1] for thing in (robot, body))
+            assert ours @ theirs > 0.999, "the robot moves like the person"
+        hips = [np.array(thing.matrix_world @ thing.pose.bones[name].head) for thing, name in ((robot, "hips"), (body, "pelvis"))]
+        assert np.linalg.norm(hips[0] - hips[1]) > 0.5, "beside it"
     take = saved / NAME / "take.toml"
     take.write_text(take.read_text() + "# mine\n")
-    assert blender.ops.tricap.load_sample() == {"FINISHED"} and not quick
+    assert blender.ops.tricap.load_sample() == {"FINISHED"} and not quick and "Robot.001" not in blender.data.objects
     assert take.read_text().endswith("# mine\n"), "a sample that is there is kept"
 
 

@@ -54,6 +54,21 @@ def armature(rig: Any, name: str) -> Any:
     return build_armature(flail(rig, frames=4, reach=0.1), name)
 
 
+def test_a_robot_to_try_it_on(blender: ModuleType) -> None:
+    """The button adds a target, which the next press lets move; what was active and selected stays, also in pose mode."""
+    source = armature(person(), "Person")
+    blender.context.view_layer.objects.active = source
+    chosen = set(blender.context.selected_objects)
+    blender.ops.object.mode_set(mode="POSE")
+    assert blender.ops.tricap.add_robot() == {"FINISHED"}
+    robot, props = blender.data.objects["Robot"], blender.context.scene.tricap_retarget
+    assert props.target == robot and blender.context.view_layer.objects.active == source and set(blender.context.selected_objects) == chosen
+    props.source = source
+    assert blender.ops.tricap.retarget() == {"FINISHED"} and robot.animation_data.action is not None
+    assert not apply.read_target(robot).rig_map.missing_notes, "all of its bones are recognised"
+    assert blender.ops.tricap.add_robot() == {"FINISHED"} and props.target.name == "Robot.001"
+
+
 def played(target: Any, frames: Any) -> Any:
     return read_motion(target, read_rig(target), [int(f) for f in frames])
 
