@@ -24,6 +24,7 @@ from ...core.cli.streams import unheard
 from ...core.foundation import store
 from ...core.foundation.bounded import check_name, real_place
 from ...core.foundation.errors import InputError
+from ...core.motion.digits import with_digits
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
 from ...core.results.folder import check_inside
@@ -48,10 +49,12 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     """
     if kind == "abc" and not out.is_dir():
         raise InputError(NO_MESHES)
+    if out.is_dir():
+        shape, of_run = skin.skin_of_run(out)
+        motion = with_digits(motion, shape)
     motion = programs.rooted(motion, program)
     with _plain_armature(kind, file, program, motion) as armature_object:
         if out.is_dir():
-            shape, of_run = skin.skin_of_run(out)
             picture = out / "skin" / TEXTURE if of_run is not None else None
             skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run, texture=picture)
             skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))

@@ -17,9 +17,11 @@ from tricap.core.geometry.rotation import matrix_from_euler, shortest
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.results.folder import Results
+from tricap.core.synthetic.sample import unpack
 
 from .conftest import SmallRun
 
+SAMPLE = Path(__file__).resolve().parents[2] / "addon" / "sample.zip"
 PLACE_M = 1e-4  # promised: 0.1 mm; measured 2e-6 (bvh, usd), 5e-6 (glb), 3e-6 (fbx)
 ANGLE_DEG = 0.1  # promised; measured 2e-3
 
@@ -62,6 +64,8 @@ def read_back(bpy: ModuleType, file: Path) -> None:
         bpy.ops.import_scene.fbx(filepath=str(file))
     elif file.suffix == ".glb":
         bpy.ops.import_scene.gltf(filepath=str(file))
+    elif file.suffix == ".abc":
+        bpy.ops.wm.alembic_import(filepath=str(file), as_background_job=False)
     else:
         bpy.ops.wm.usd_import(filepath=str(file))
 
@@ -103,6 +107,23 @@ def test_a_run_goes_out_in_every_format(empty: ModuleType, small_run: SmallRun, 
     file = tmp_path / f"out.{kind}"
     said = export_file(small_run.out, kind, file, "plain", Monitor())
     assert file.exists() and "6 f" in said, said
+
+
+@pytest.mark.parametrize("kind", ["fbx", "glb", "usd", "abc"])
+def test_fingers_and_toes_go_with_the_measured_skin(empty: ModuleType, tmp_path: Path, kind: str) -> None:
+    """The sample walks 0.2 m: what does not move with the rest stretches the skin."""
+    unpack(SAMPLE, tmp_path / "sample")
+    file = tmp_path / f"walk.{kind}"
+    export_file(tmp_path / "sample" / "results", kind, file, "plain", Monitor())
+    read_back(empty, file)
+    (skin,) = [thing for thing in empty.data.objects if thing.type == "MESH" and len(thing.data.polygons) > 5_000]
+    empty.context.scene.frame_set(round(empty.context.scene.frame_end))
+    played = skin.evaluated_get(empty.context.evaluated_depsgraph_get()).to_mesh()
+    places, edges = np.empty(3 * len(played.vertices)), np.empty(2 * len(played.edges), dtype=np.int32)
+    played.vertices.foreach_get("co", places)
+    played.edges.foreach_get("vertices", edges)
+    ends = places.reshape(-1, 3)[edges.reshape(-1, 2)] * skin.matrix_world.to_scale()[0]
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 0.06
 
 
 def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
