@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..body.limb_words import frame_list
+from ..body.model_file import model_names
 from ..body.motion import BodyMotion
 from ..body.shape import BodyShape, read_body
 from ..body.skin.fingers import shape_for_skin
@@ -23,6 +24,7 @@ from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.no_surface import background_regions, empty_clouds
 from ..fitting.inputs.take_inputs import check_body, fit_input
 from ..fitting.stages.fit_again import EarlierFit, around, fit_again, with_held
+from ..fitting.stages.set_up import of_model
 from ..foundation import store
 from ..foundation.arrays import LazySequence
 from ..foundation.errors import InputError
@@ -34,7 +36,7 @@ from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import last_cloud
 from ..take.footage import Footage, open_take
-from ..take.take import FrameClicks, read_take
+from ..take.take import AUTO_BODY, FrameClicks, Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import read_trajectories
 from .record import FrameTable, read_frame_table, write_frame_table
@@ -92,6 +94,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         changed = _changed(before.get("clicks", {}), now["clicks"])
         if not changed:
             raise InputError("No joints were clicked or pulled since the body was fitted; drag a joint first.")
+        model = _model_of(take, record["stages"]["fit"])
         body = _Body.read(results)
         stretches = around([*changed], body.motion.frames, body.motion.time_s)
         if not stretches:
@@ -99,7 +102,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         parts = []
         for i, rows in enumerate(stretches):
             joints = {name for frame, names in changed.items() if frame in body.motion.frames[rows] for name in names}
-            parts.append(_fitted(footage, results, settings, body, rows, joints, monitor.part("fit", i, len(stretches))))
+            parts.append(_fitted(footage, results, settings, body, rows, joints, model, monitor.part("fit", i, len(stretches))))
         _write(results, settings["skin"], body, parts)
         again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
         record["stages"]["fit"] |= {FITTED_WITH: now, AGAIN: again}
@@ -111,6 +114,19 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         before=body.motion.values[np.isin(body.motion.frames, np.concatenate([part.frames for part in parts]))],
         after=np.concatenate([part.values for part in parts]),
     )
+
+
+def _model_of(take: Take, fit: Mapping[str, Any]) -> str:
+    """The model of the fitted body: the take's, or the one that the `fit` of run.json chose.
+
+    Raises:
+        InputError: it chose one that is not ours.
+    """
+    if take.body_model != AUTO_BODY:
+        return str(take.body_model)
+    if (chosen := fit.get("chosen_model")) not in model_names():
+        raise InputError("run.json does not say which body was fitted; run the whole fit again (Fit Body).")
+    return str(chosen)
 
 
 def _clicked(footage: Footage) -> list[FrameClicks]:
@@ -186,7 +202,14 @@ class _Body:
 
 
 def _fitted(
-    footage: Footage, results: Results, settings: Mapping[str, Any], body: _Body, rows: range, joints: set[str], monitor: Monitor
+    footage: Footage,
+    results: Results,
+    settings: Mapping[str, Any],
+    body: _Body,
+    rows: range,
+    joints: set[str],
+    model: str,
+    monitor: Monitor,
 ) -> BodyMotion:
     """The new motion of some rows of the earlier one."""
     fitting, wider = settings["fitting"], with_held(rows, len(body.motion.frames))
@@ -203,7 +226,7 @@ def _fitted(
     background = background_regions(footage, results, clouds, fitting, monitor, wider)
     part = replace(footage, frames=footage.frames[wider.start : wider.stop])
     chosen = clouds_for_fit(part, [clouds[row] for row in wider], trajectories, background, fitting, results, monitor)
-    given = fit_input(part, chosen, trajectories, results, background)
+    given = of_model(fit_input(part, chosen, trajectories, results, background), model)
     return fit_again(given, body.earlier, rows, joints, fitting, monitor)
 
 

@@ -89,7 +89,7 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
     start = None if given.keypoints else find_joints(given, settings, monitor)
     if not is_chosen:
         located = _located_joints(given, settings)
-        given = _of_model(given, start.model if start is not None else smallest_model(located) if located else WHOLE_BODY)
+        given = of_model(given, start.model if start is not None else smallest_model(located) if located else WHOLE_BODY)
         if not needs_start(given, settings):
             return given
     certain = start is not None and start.probability >= settings.least_start_probability
@@ -116,7 +116,7 @@ def _nobody_found(model: str, is_chosen: bool) -> str:
     )
 
 
-def _of_model(given: FitInput, model: str) -> FitInput:
+def of_model(given: FitInput, model: str) -> FitInput:
     """The input for another model: with the limits that it has, too."""
     dofs = {dof.name for dof in read_model(model).skeleton.dofs}
     limits = {name: limit for name, limit in given.limits.items() if name in dofs}
@@ -162,7 +162,7 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
     for shown, model in PERSONS.items():
         if given.model == WHOLE_BODY != model:
             break  # a whole body is not begun by a part of it
-        fit = replace(_without_start(_of_model(given, model), settings, points_of), monitor=monitor)
+        fit = replace(_without_start(of_model(given, model), settings, points_of), monitor=monitor)
         if (start := find_start(fit, points_of, given.frames, given.time_s, monitor, shown, without)) is not None:
             return start
     return None

@@ -1,0 +1,58 @@
+"""A finished body, here that of the sample, fitted again around new clicks."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.rig import read_rig
+from tricap.core.motion.tables import read_joints
+from tricap.core.run.around_clicks import FITTED_WITH, fit_around_clicks, fitted_with
+from tricap.core.run.settings import settings_of
+from tricap.core.synthetic.sample import unpack
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
+
+SAMPLE = Path(__file__).resolve().parents[3] / "addon" / "sample.zip"
+FRAME, SHIFT_M = 6, np.array([0.0, 0.0, 0.03])
+
+
+@pytest.fixture
+def sample(tmp_path: Path) -> Path:
+    """The sample as if its body had been chosen automatically, with its wrist clicked 3 cm above where the fit has it, in one frame."""
+    take = tmp_path / "sample"
+    unpack(SAMPLE, take)
+    said, file = (take / "take.toml").read_text(), take / "results" / "run.json"
+    (take / "take.toml").write_text(said.replace('model = "full"\n', "", 1))
+    run = json.loads(file.read_text())
+    opened = read_take(take)
+    settings = settings_of(opened.settings, {}, "take.toml")
+    run["stages"]["fit"] |= {FITTED_WITH: fitted_with(open_take(opened), settings, file.parent), "chosen_model": "full"}
+    file.write_text(json.dumps(run))
+    place = read_joints(take / "results" / "joints.csv").joints_m["wrist.R"][FRAME] + SHIFT_M
+    at = ", ".join(f"{c.name} = {c.project(place[None])[0].round(2).tolist()}" for c in read_rig(take / "rig.toml").cameras)
+    with (take / "take.toml").open("a", encoding="utf-8") as file:
+        file.write(f'\n[[keyframes]]\nframe = {FRAME}\n[keyframes.joints]\n"wrist.R" = {{ {at} }}\n')
+    return take
+
+
+def test_a_body_that_was_chosen_automatically(sample: Path) -> None:
+    out = sample / "results"
+    before = read_joints(out / "joints.csv").joints_m
+    found = fit_around_clicks(sample, out, {}, Monitor())
+    assert found is not None and FRAME in found.frames
+    after = read_joints(out / "joints.csv").joints_m
+    assert (after["wrist.R"] - before["wrist.R"])[FRAME] @ SHIFT_M > 0.3 * SHIFT_M @ SHIFT_M, "towards the click"
+    assert np.abs(after["wrist.L"] - before["wrist.L"]).max() < 1e-4, "the other arm stays"
+
+
+def test_a_body_that_is_not_ours_is_not_read(sample: Path) -> None:
+    file = sample / "results" / "run.json"
+    run = json.loads(file.read_text())
+    run["stages"]["fit"]["chosen_model"] = str(sample / "other.toml")
+    file.write_text(json.dumps(run))
+    with pytest.raises(InputError, match="does not say which body was fitted"):
+        fit_around_clicks(sample, sample / "results", {}, Monitor())
