@@ -151,6 +151,16 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, header
 
 
+def header_of(path: Path) -> dict[str, Any]:
+    """The header of a file written by `save`, without its arrays; empty if there is none that can be read."""
+    try:
+        with bounded.opened(path, bounded.ARRAYS_BYTES) as file, np.load(file, allow_pickle=False) as data:
+            header = bounded.json_of(str(data[HEADER]))
+    except (*DAMAGED, InputError):
+        return {}
+    return header if isinstance(header, dict) else {}
+
+
 def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[str, str]) -> None:
     """Check that each array exists, with one of the kinds (numpy's letters) and the shape, as in `frames=("iu", "T"), xyz_m=("f", "TN3")`:
     a digit is a length, a letter the same length everywhere.

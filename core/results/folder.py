@@ -132,6 +132,10 @@ class Results:
             return None  # a damaged checkpoint is computed again
         return arrays if header.get("key") == key else None
 
+    def has_checkpoint(self, stage: str, name: str, key: str) -> bool:
+        """Whether there is a checkpoint from this input; its arrays are not read."""
+        return store.header_of(self.path("cache", stage, f"{name}.npz")).get("key") == key
+
     def save_checkpoint(self, stage: str, name: str, key: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a checkpoint."""
         store.save(self.path("cache", stage, f"{name}.npz"), arrays, {"key": key}, compress=False)

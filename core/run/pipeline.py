@@ -73,15 +73,18 @@ def measure(run: Run, monitor: Monitor) -> None:
         InputError: the footage cannot be read, or nothing can be measured.
         Cancelled: the frames measured so far are kept.
     """
-    began, summaries, frames = time.perf_counter(), list[FrameSummary](), run.footage.frames
+    began, summaries, kept, frames = time.perf_counter(), list[FrameSummary](), set[int](), run.footage.frames
     run.results.remove_other_clouds(frames)
     if run.settings["timing"].correct and not run.footage.delay_images:
         run.footage, run.record["offsets"] = synchronised(run.footage, monitor)
     try:
         with run.resumable(
-            stopped=lambda: f"Stopped: the surface of {len(summaries)} of {len(frames)} frames is kept; run it again to go on."
+            stopped=lambda: (
+                f"Stopped: the surface of {len(kept.union(s.frame for s in summaries))} of {len(frames)} frames is kept; "
+                "run it again to go on."
+            )
         ):
-            foreground = _measured_from_somewhere(run, summaries, monitor)
+            foreground = _measured_from_somewhere(run, summaries, kept, monitor)
     except NothingMeasured as error:
         return _no_surface(run, error, monitor)
     summaries.sort(key=lambda summary: summary.frame)
@@ -204,10 +207,10 @@ def is_complete(run: Run) -> bool:
 # ---- the steps of the stages ---------------------------------------------------------------------------------------------
 
 
-def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
+def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], kept: set[int], monitor: Monitor) -> Foreground | None:
     """As `_measure_frames`; if the first frame shows nothing and no certain cause is found, from another one, or with pairs of views."""
     try:
-        return _measure_frames(run, summaries, monitor)
+        return _measure_frames(run, summaries, kept, monitor)
     except NothingMeasured as error:
         if any(cause.certain for cause in causes_of_failure(run.footage, monitor)):
             raise
@@ -217,14 +220,14 @@ def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], monitor: M
         run.warn(begin.sentence(error.frame))
         run.begin, growing = begin.frame, run.settings["growing"]
         run.settings["growing"] = replace(growing, pairs=growing.pairs or begin.pairs)
-        return _measure_frames(run, summaries, monitor)
+        return _measure_frames(run, summaries, kept, monitor)
 
 
-def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
-    """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground."""
+def _measure_frames(run: Run, summaries: list[FrameSummary], kept: set[int], monitor: Monitor) -> Foreground | None:
+    """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground. `kept`: see `measure_at_once`."""
     s, foreground = run.settings, None
     if run.engine is not None:
-        measure_at_once(run, run.engine, monitor)
+        measure_at_once(run, run.engine, monitor, kept)
     for m in measure_frames(run.measured_footage, MeasureSettings.of(s), run.results, monitor, run.begin):
         write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
         summaries.append(summary_of(m))

@@ -7,6 +7,7 @@ same bytes for any number of workers, and a stopped run resumes.
 import json
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,7 @@ from typing import Any
 
 from ..foundation import bounded
 from ..foundation.errors import InputError
-from ..foundation.progress import Monitor
+from ..foundation.progress import Cancelled, Monitor
 from ..foundation.settings import from_table, to_table
 from ..results.folder import Results
 from ..surface.measure import measure_frames, measure_piece
@@ -32,12 +33,16 @@ from .take_run import Run, only_frames
 
 PIECE = 4  # frames of a task
 WAIT_S = 0.2  # between two looks at the workers
+OWN_GROUP: dict[str, Any] = {"process_group": 0}  # of a worker: the Ctrl-C of a terminal does not reach it; we end it
+if sys.platform == "win32":
+    OWN_GROUP = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
 FEWEST = 12  # frames to be measured; for fewer, local processes take longer to start than they gain
 Task = dict[str, Any]  # plain values: it travels as JSON
 
 
-def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
-    """Measure the frames of a run by workers, as far as they have no checkpoints. Nothing where frames depend on each other.
+def measure_at_once(run: Run, engine: Engine, monitor: Monitor, kept: set[int]) -> None:
+    """Measure the frames of a run by workers, as far as they have no checkpoints. Nothing where frames depend on each other. If it is
+    stopped, those that have one are added to `kept`.
 
     Raises:
         InputError: the images cannot be read, workers keep dying, or Dask cannot be used.
@@ -53,22 +58,26 @@ def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
     steps = 1 + len(starts.order)
     first = measure_frames(footage, settings, run.results, monitor.part("seeds", 0, steps), run.begin)
     next(first)  # fails early where nothing can be measured
-    waiting, least = list[tuple[int, str]](), FEWEST if engine.scheduler is None else 1
-    with _running(engine) as submit:
-        work = list[Any]()
-        for done, frame in enumerate(starts.order):
-            key = starts.at(frame, monitor.part("seeds", 1 + done, steps))[0].key
-            if run.results.load_checkpoint("surface", f"{frame:04d}", key) is None:
-                waiting.append((frame, key))
-            if len(waiting) >= least:
-                least = PIECE
-                while len(waiting) >= PIECE:  # always the same frames, whatever the number of workers
-                    work.append(submit(_task(run, dict(waiting[:PIECE]))))
-                    del waiting[:PIECE]
-        if waiting and least == PIECE:
-            work.append(submit(_task(run, dict(waiting))))
-        for finished in _finished(work):
-            monitor.step("surface", finished, len(work))
+    waiting, least, keys = list[tuple[int, str]](), FEWEST if engine.scheduler is None else 1, dict[int, str]()
+    try:
+        with _running(engine) as submit:
+            work = list[Any]()
+            for done, frame in enumerate(starts.order):
+                key = keys[frame] = starts.at(frame, monitor.part("seeds", 1 + done, steps))[0].key
+                if run.results.load_checkpoint("surface", f"{frame:04d}", key) is None:
+                    waiting.append((frame, key))
+                if len(waiting) >= least:
+                    least = PIECE
+                    while len(waiting) >= PIECE:  # always the same frames, whatever the number of workers
+                        work.append(submit(_task(run, dict(waiting[:PIECE]))))
+                        del waiting[:PIECE]
+            if waiting and least == PIECE:
+                work.append(submit(_task(run, dict(waiting))))
+            for finished in _finished(work):
+                monitor.step("surface", finished, len(work))
+    except Cancelled:
+        kept.update(frame for frame, key in keys.items() if run.results.has_checkpoint("surface", f"{frame:04d}", key))
+        raise
 
 
 class Pieces:
@@ -204,8 +213,9 @@ class _Worker:
     def _ask(self, line: str) -> str:
         """The answer of the process; empty if it died."""
         if self._process is None:
+            pipe = subprocess.PIPE
             self._process = subprocess.Popen(
-                self._command, env=self._environment, text=True, encoding="utf-8", stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                self._command, env=self._environment, text=True, encoding="utf-8", stdin=pipe, stdout=pipe, **OWN_GROUP
             )
             if self._stopped:  # meanwhile: `stop` may not have seen the process
                 self._process.kill()

@@ -30,7 +30,7 @@ def checkpoints(out: Path) -> dict[str, bytes]:
 def measured(take: Path, out: Path, engine: Engine, monitor: Monitor | None = None) -> dict[str, bytes]:
     """The checkpoints of a take that an engine measured."""
     with take_run.open_run(take, out) as job:
-        workers.measure_at_once(job, engine, monitor or Monitor())
+        workers.measure_at_once(job, engine, monitor or Monitor(), set())
     return checkpoints(out)
 
 
@@ -52,6 +52,30 @@ def test_a_stopped_run_resumes_and_leaves_no_process(plane_take: Path, tmp_path:
         measured(plane_take, tmp_path / "out", TWO, monitor)
     assert started and all(process.poll() is not None for process in started)
     assert measured(plane_take, tmp_path / "out", TWO) == measured(plane_take, tmp_path / "again", TWO)
+
+
+PRESSED = """import os, signal, sys
+from tricap.__main__ import main
+from tricap.core.run import workers
+workers.FEWEST = workers.PIECE = 1
+finished = workers._finished
+def pressed(work):
+    for done in finished(work):
+        if done:
+            os.killpg(0, signal.SIGINT)
+        yield done
+workers._finished = pressed
+sys.exit(main(sys.argv[1:]))"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a terminal there has no process groups")
+def test_ctrl_c_in_a_terminal_is_one_sentence_with_the_true_count(plane_take: Path, tmp_path: Path) -> None:
+    """It goes to the whole group of processes; what the workers have measured by then counts."""
+    line = [sys.executable, "-P", "-c", PRESSED, "measure", plane_take, "--out", tmp_path / "out", "--quiet"]
+    done = subprocess.run(line, capture_output=True, text=True, start_new_session=True)
+    kept = len(list((tmp_path / "out" / "cache" / "surface").iterdir()))
+    assert done.returncode == 130 and kept >= 1
+    assert done.stderr == f"tricap: Stopped: the surface of {kept} of 4 frames is kept; run it again to go on.\n"
 
 
 def test_what_a_worker_refuses_is_said_in_one_sentence(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
