@@ -17,6 +17,7 @@ from ..scene.looking import show_all_frames
 from . import watch
 from .cameras import use_calibration_in
 from .simple_operator import SimpleOperator
+from .states import is_rate_assumed
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -106,7 +107,7 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
         if len(entries) > 1:
             project.write(scene)
         names = ", ".join(entry["name"] for entry, _ in made)
-        rate = f"{round(scene.tricap.fps, 3):g} fps"
+        rate = f"{round(scene.tricap.fps, 3):g} fps{' (assumed: images state none)' if is_rate_assumed(scene) else ''}"
         return f"{len(made)} views added, {rate}, from left to right: {names}. If that is wrong, correct it in step 1."
 
 

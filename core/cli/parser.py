@@ -77,7 +77,7 @@ def _new(commands: Any) -> None:
     new.add_argument("take", type=Path, metavar="TAKE", help="the folder to create")
     new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
     new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="the lines of interlaced video to measure")
-    new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
+    new.add_argument("--fps", type=float, default=None, metavar="F", help="images per second (default: what the movies state, or else 25)")
     new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or a calibration of another tool")
     about = (
         f"the body model: {', '.join(model_names())}, your own .toml file, or none (surface and tracks only); "

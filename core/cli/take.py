@@ -9,8 +9,11 @@ from ..fitting.settings import START_ALONE
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..images.sequence import movie_rate
 from ..take.bar_file import read_bar, write_bar
 from ..take.writing import footage_entry, make_take, new_table, take_of_table
+
+ASSUMED_FPS = 25.0  # of images, of which nobody says how many a second there are
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -29,7 +32,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         if sources.count(source) > 1:
             raise InputError(f"View {name} has the same footage as another view, {source}; give each view the footage of its own camera.")
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
-    table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
+    stated = [rate for _, source in links if not source.is_dir() and (rate := round(movie_rate(source), 6)) > 0]
+    fps = args.fps if args.fps is not None else next(iter(stated), ASSUMED_FPS)
+    table = new_table(entries, fps=fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
     if take.joints_model and not take.joints_model.endswith(".toml"):  # a user's own model may be copied into the folder later
         read_model(take.joints_model)
@@ -42,6 +47,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         write_bar(folder / "rig.toml", rig, *bar)
     todo = [] if rig else ["copy or calibrate rig.toml into it"]
     todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model and take.body_model not in START_ALONE else []
-    return [
-        f"{folder}: a take of {len(views)} views, {args.fps:g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."
-    ]
+    lines = [f"{folder}: a take of {len(views)} views, {fps:.6g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."]
+    if args.fps is None and not stated:
+        lines.append(f"Images state no frame rate, so {fps:g} is assumed; if it is another, correct `fps` in {folder / 'take.toml'}.")
+    return lines

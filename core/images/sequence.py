@@ -248,6 +248,16 @@ class Movie:
         return float(np.abs(shown - (first + step * frames)).max() / step) if step > 0 else 0.0
 
 
+def movie_rate(path: Path) -> float:
+    """The images per second that a movie file states; 0 if it states none.
+
+    Raises:
+        InputError: it is no movie that can be read.
+    """
+    _check_movie(path)
+    return max(float(_capture(path).get(cv2.CAP_PROP_FPS)), 0.0)
+
+
 def _capture(path: Path) -> Any:
     """A decoder that applies the orientation in the movie's header, which OpenCV 4 does on request only."""
     capture = cv2.VideoCapture(str(path))

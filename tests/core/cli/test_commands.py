@@ -316,6 +316,25 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     assert "is a take already" in capfd.readouterr().err
 
 
+def test_new_takes_the_movies_frame_rate_and_says_what_it_assumes(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    for name in "LCR":
+        writer = cv2.VideoWriter(str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 29.97, (200, 150))
+        for _ in range(4):
+            writer.write(np.zeros((150, 200, 3), np.uint8))
+        writer.release()
+    movies, images = ([f"{name}={folder / (name + ending)}" for name in "LCR"] for folder, ending in ((tmp_path, ".avi"), (take, "")))
+    for made, views, more, fps, said in (
+        ("movies", movies, [], 29.97, "29.97 images per second. Next"),
+        ("told", movies, ["--fps", "60"], 60.0, "60 images per second. Next"),
+        ("images", images, [], 25.0, "Images state no frame rate, so 25 is assumed"),
+        ("told too", images, ["--fps", "25"], 25.0, "25 images per second. Next"),
+    ):
+        assert main.main(["new", str(tmp_path / made), "--views", *views, *more]) == 0
+        printed = capfd.readouterr().out
+        assert read_take(tmp_path / made).fps == pytest.approx(fps, abs=1e-5) and said in printed
+        assert ("assumed" in printed) == (made == "images")
+
+
 def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capture) -> None:
     views = [f"{name}={take / name}" for name in "LCR"]
     assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
