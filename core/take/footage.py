@@ -215,9 +215,10 @@ def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
     first = per * max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:
         if len(set(counts)) > 1:
-            lengths = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
-            advice = "Trim them, or set `offset_frames` or `frames` in take.toml."
-            raise InputError(f"The views of {take.folder.name} are not equally long: {lengths} frames. {advice}")
+            ends = ", ".join(f"{v.name} ends with frame {c - 1}" for v, c in zip(take.views, counts))
+            common = f"write `frames = [{first}, {min(counts)}]` in take.toml, which all views show, or " if first < min(counts) else ""
+            advice = f"{common}correct `offset_frames`."
+            raise InputError(f"The views of {take.folder.name} end differently: {ends}; {advice}")
         if counts[0] <= first:
             raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no common frame; correct them in take.toml.")
         return range(first, counts[0])

@@ -36,7 +36,8 @@ class StartJoints:
         side = {"L": "left ", "R": "right "}.get(self.ask[-1], "") if "." in self.ask else ""
         return (
             f"It is not certain how the person stands in frame {self.frame} ({self.probability:.0%}): {' or '.join(doubts[:2])}. "
-            f"Click the {side}{self.ask.partition('.')[0]} in two views of frame {self.frame}, and run it again."
+            f"Click the {side}{self.ask.partition('.')[0]} in two views of frame {self.frame}, or three of neck, shoulders, pelvis and "
+            "hips, which always suffice; then run it again."
         )
 
 

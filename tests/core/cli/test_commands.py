@@ -56,7 +56,7 @@ def click(take: Path, more: str) -> None:
 FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no take": (lambda t: (t / "take.toml").unlink(), "is not a take"),
     "missing image": (lambda t: (t / "L" / "0002.png").unlink(), "View L lacks the image(s) between 0001.png and 0003.png"),
-    "unequal length": (lambda t: (t / "R" / "0004.png").unlink(), "not equally long: L has 5, C has 5, R has 4 frames"),
+    "unequal length": (lambda t: (t / "R" / "0004.png").unlink(), "R ends with frame 3; write `frames = [0, 4]`"),
     "no images": (lambda t: shutil.rmtree(t / "R"), "View R has no images"),
     "rig missing": (lambda t: (t / "rig.toml").unlink(), "Cannot read the rig"),
     "rig lacks a view": (lambda t: edit(t, 'name = "R"', 'name = "X"', "rig.toml"), "The rig has no camera “R”"),
