@@ -8,8 +8,6 @@ from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings, begun_at_rest
 from ...core.synthetic.robot import Robot, robot
 from ..panels import TellingOperator
-from ..scene import nodes
-from ..scene.skin import bind
 from . import apply
 from .operators import compute
 from .read import action_frames, read_motion, read_rig
@@ -56,6 +54,9 @@ def add_robot(context: bpy.types.Context) -> bpy.types.Object:
 
 
 def _add_mesh(rig: bpy.types.Object, collection: bpy.types.Collection, built: Robot) -> None:
+    from ..scene import nodes
+    from ..scene.skin import bind
+
     mesh = bpy.data.meshes.new(NAME)
     mesh.from_pydata(built.vertices_m.tolist(), [], built.faces.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(built.faces), dtype=bool))

@@ -6,7 +6,7 @@ read_contents (any thread) → write_scene (main thread) → save_blend
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from mathutils import Matrix
 
 from ...core.body.fields import potential_named
 from ...core.body.skin.texture import TEXTURE
+from ...core.cli.streams import unheard
 from ...core.foundation import store
 from ...core.foundation.bounded import real_path, real_place
 from ...core.foundation.errors import InputError
@@ -211,7 +212,7 @@ def save_blend(path: Path) -> None:
     part = store.part_of(path)
     try:
         store.try_writing(part)
-        with _relative_caches(path):
+        with _relative_caches(path), unheard() if bpy.app.background else nullcontext():  # it tells the name of the partial file
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
         if path.exists() and not (path.name == "body.blend" and (path.parent / "run.json").exists()):
             os.replace(path, path.with_suffix(".blend1"))  # as Blender itself does
@@ -397,7 +398,7 @@ def _add_body(
     armature_object = armature.add_armature(collection, shape, stand)
     armature_object.data[REST_POSE_KEY] = options.rest_pose
     flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
-    counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
+    counts = {"bones": len(armature.rig_bones(shape)), "metaball parts": len(flesh)}
     if len(shape.metaballs.weight):
         layers.add_ellipsoids(collection, armature_object, shape, stand.lift_m if stand is not None else 0.0)
     try:

@@ -39,9 +39,11 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if take.joints_model and not take.joints_model.endswith(".toml"):  # a user's own model may be copied into the folder later
         read_model(take.joints_model)
     rig = read_any(args.rig) if args.rig else None
-    if rig:
-        for view in take.views:
-            rig[view.name]
+    cameras = [camera.name for camera in rig.cameras] if rig else []
+    if rig and (unknown := [view.name for view in take.views if view.name not in cameras]):
+        raise InputError(
+            f"{args.rig} has no camera “{unknown[0]}”, but {', '.join(cameras)}; give --views these names, such as {cameras[0]}=FILE."
+        )
     make_take(folder, table, links, rig)
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)

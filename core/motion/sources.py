@@ -53,8 +53,10 @@ def from_run(out: Path) -> Motion:
     """The motion of the body in a run's folder; frames without a solution are interpolated linearly.
 
     Raises:
-        InputError: body.toml or motion.csv are missing or damaged, or no frame has a solution.
+        InputError: body.toml or motion.csv are missing or damaged, no frame has a solution, or the folder is a take.
     """
+    if (out / "take.toml").is_file() and not (out / "body.toml").is_file():
+        raise InputError(f"{out} is a take; give the folder with its results instead, which `tricap run` wrote.")
     shape = read_body(out / "body.toml")
     table = read_motion(out / "motion.csv", shape.skeleton)
     known = np.isfinite(table.values).all(axis=1)

@@ -335,6 +335,13 @@ def test_new_takes_the_movies_frame_rate_and_says_what_it_assumes(take: Path, tm
         assert ("assumed" in printed) == (made == "images")
 
 
+def test_new_names_the_cameras_that_the_views_should_have(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    views = [f"{name}={take / folder}" for name, folder in (("left", "L"), ("C", "C"), ("R", "R"))]
+    assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--rig", str(take / "rig.toml")]) == 2
+    said = capfd.readouterr().err
+    assert "has no camera “left”, but L, C, R; give --views these names, such as L=FILE." in said and not (tmp_path / "new").exists()
+
+
 def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capture) -> None:
     views = [f"{name}={take / name}" for name in "LCR"]
     assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
@@ -383,7 +390,7 @@ NEW_FAULTS = {
     "fps": (["L={t}/L", "C={t}/C"], ["--fps", "nan"], "`fps` of"),
     "fps 0": (["L={t}/L", "C={t}/C"], ["--fps", "0"], "`fps` of"),
     "rig missing": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/none.toml"], "none.toml is missing"),
-    "rig of others": (["L={t}/L", "X={t}/C"], ["--rig", "{t}/rig.toml"], "The rig has no camera “X”"),
+    "rig of others": (["L={t}/L", "X={t}/C"], ["--rig", "{t}/rig.toml"], "has no camera “X”, but L, C, R"),
     "rig is none": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/L/0000.png"], "is of no known kind"),
 }
 

@@ -328,3 +328,9 @@ def test_all_motions_at_hand_are_read_and_mapped(tmp_path: Path) -> None:
         some = re.sub(r"Frames:\s*\d+", "Frames: 5", skeleton) + "Frame Time:" + "\n".join(motion.splitlines()[:6]) + "\n"
         (tmp_path / path.name).write_text(some)
         assert not find_map(read_bvh(tmp_path / path.name).rig).missing, path
+
+
+def test_a_take_is_no_motion(tmp_path: Path) -> None:
+    (tmp_path / "take.toml").write_text("")
+    with pytest.raises(InputError, match="is a take; give the folder with its results instead"):
+        read_motion_source(tmp_path)
