@@ -31,7 +31,7 @@ THIN = 0.4  # of the usual number of points
 LARGE_SIGMA_MM = 5.0  # of a point
 LARGE_SIGMA_DEG = 15.0  # of a joint angle
 RAYS_PX = 1.0  # distance between the rays of matched points
-NEAR_M = 0.12  # distance from a bone within which points belong to its limb
+NEAR_M = 0.03  # beyond the largest ball of a bone: points so near belong to it
 FEWEST_ON_LIMB = 30  # points
 MOST_LISTED = 8  # frames
 NEEDED = {"measure": ("clouds",), "track": ("trajectories.npz",), "fit": ("body.toml", "joints.csv", "motion.csv"), "report": ("report",)}
@@ -183,11 +183,12 @@ def _body(folder: Path, figures: dict[str, Any]) -> list[Finding]:
     if not path.is_file():
         return findings
     xyz, t = read_ply(path).xyz_m, int(np.flatnonzero(joints.frames == frame)[0])
-    bare = []
-    for bone in shape.skeleton.bones:
-        if bone.head_joint in joints.joints_m and bone.tail_joint in joints.joints_m:
-            near = _distance(xyz, joints.joints_m[bone.head_joint][t], joints.joints_m[bone.tail_joint][t]) < NEAR_M
-            if near.sum() < FEWEST_ON_LIMB:
+    bare, balls = [], shape.metaballs
+    for b, bone in enumerate(shape.skeleton.bones):
+        own = balls.radii_m[balls.bone_index == b][:, [0, 2]]  # across the bone
+        if len(own) and bone.head_joint in joints.joints_m and bone.tail_joint in joints.joints_m:
+            away_m = _distance(xyz, joints.joints_m[bone.head_joint][t], joints.joints_m[bone.tail_joint][t])
+            if (away_m < own.max() + NEAR_M).sum() < FEWEST_ON_LIMB:
                 bare.append(bone.name)
     if bare:
         findings.append(

@@ -18,9 +18,13 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.motion.formats.ply import read_ply, write_cloud
+from tricap.core.motion.tables import read_joints
 from tricap.core.run import pipeline
 from tricap.core.run.take_run import open_run
 from tricap.core.synthetic.arm import arm_rig
+from tricap.core.synthetic.sample import unpack
+
+SAMPLE = Path(__file__).resolve().parents[3] / "addon" / "sample.zip"
 
 CAMERAS = arm_rig(768).cameras
 
@@ -193,6 +197,23 @@ def test_a_run_makes_again_what_is_gone_or_cut(finished: Path, tmp_path: Path) -
         pipeline.run(finished / "take", out, again, frames=(0, 5))
         for name in ("clouds/0001.ply", "joints.csv"):
             assert (out / name).read_bytes() == (finished / "out" / name).read_bytes()
+
+
+def test_the_points_of_a_trunk_lie_on_its_flesh(tmp_path: Path) -> None:
+    """A stout person, whose surface is nowhere near the spine, is as well measured as another one; bare shins are told."""
+    unpack(SAMPLE, tmp_path / "sample")
+    out = tmp_path / "sample" / "results"
+    joints = read_joints(out / "joints.csv")
+    for path in (out / "clouds").iterdir():
+        v = read_ply(path).vertex
+        low, high = (joints.joints_m[name][joints.frames.tolist().index(int(path.stem))] for name in ("pelvis", "neck"))
+        xyz = np.stack([v[a] for a in "xyz"], 1)
+        inner = (np.hypot(*(xyz - (low + high) / 2)[:, :2].T) < 0.13) & (v["z"] > low[2] - 0.05) & (v["z"] < high[2])
+        rows = ~inner & (v["z"] > 0.35)
+        write_cloud(path, xyz_m=xyz[rows], sigma_m=v["sigma"][rows], intensity=v["intensity"][rows],
+                    normals=np.stack([v[a] for a in ("nx", "ny", "nz")], 1)[rows])  # fmt: skip
+    (found,) = [f for f in check_run(out, Monitor()).findings if "hardly any measured points" in f.sentence]
+    assert "foot.L" in found.sentence and "spine" not in found.sentence and "hip" not in found.sentence
 
 
 def test_views_from_too_far_apart_are_found():
