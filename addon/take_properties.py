@@ -5,6 +5,7 @@ from typing import Any
 import bpy
 
 from ..core.images.interlace import BOTH, INTERLACE
+from ..core.take.writing import ASSUMED_FPS
 from .scene.clips import frames_per_image
 from .session import get_session
 
@@ -103,7 +104,7 @@ def annotations() -> dict[str, Any]:
         "views": props.CollectionProperty(type=View),
         "view_index": props.IntProperty(name="View"),
         "fps": props.FloatProperty(
-            name="FPS", default=25.0, min=0.1, max=10_000.0, precision=3, description="Frames per second of the footage", **watched
+            name="FPS", default=ASSUMED_FPS, min=0.1, max=10_000.0, precision=3, description="Frames per second of the footage", **watched
         ),
         "interlaced": props.EnumProperty(
             name="Interlacing",

@@ -6,7 +6,7 @@ from mathutils import Vector
 
 from ...core.foundation.errors import InputError
 from ...core.motion.retarget.retarget import Retargeted
-from ...core.motion.retarget.rig import Motion, channels, head_of
+from ...core.motion.retarget.rig import Motion, Rig, channels, head_of
 from .apply import set_range
 from .write import write_action
 
@@ -20,28 +20,11 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     Raises:
         InputError: a bone has no length.
     """
-    rig = motion.rig
-    roots = np.flatnonzero(rig.parents < 0)
-    armature = bpy.data.armatures.new(name)
-    armature_object = bpy.data.objects.new(name, armature)
-    scene = bpy.context.scene
-    scene.collection.objects.link(armature_object)
-    bpy.context.view_layer.objects.active = armature_object
-    bpy.ops.object.mode_set(mode="EDIT")
-    for b, bone_name in enumerate(rig.names):
-        length = float(np.linalg.norm(rig.tail_m[b] - rig.head_m[b]))
-        if length < SHORTEST_M:
-            bpy.ops.object.mode_set(mode="OBJECT")
-            raise InputError(f"The bone “{bone_name}” has no length; give it one in the source.")
-        bone = armature.edit_bones.new(bone_name)
-        bone.head, bone.tail = rig.head_m[b], rig.head_m[b] + length * rig.R_rest[b][:, 1]
-        bone.align_roll(Vector(rig.R_rest[b][:, 2]))
-        if rig.parents[b] >= 0:
-            bone.parent = armature.edit_bones[rig.names[rig.parents[b]]]
-    bpy.ops.object.mode_set(mode="OBJECT")
+    rig, scene = motion.rig, bpy.context.scene
+    armature_object = armature_of_rig(rig, name, scene.collection)
     set_range(scene, motion)
     basis, driven = channels(rig, motion.R), np.ones(len(rig.names), dtype=bool)
-    first = int(roots[0])
+    first = int(np.flatnonzero(rig.parents < 0)[0])
     shift_m = motion.head_m[:, first] - rig.head_m[first]
     write_action(
         armature_object,
@@ -60,6 +43,31 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
         ),
         name,
     )
+    return armature_object
+
+
+def armature_of_rig(rig: Rig, name: str, collection: bpy.types.Collection) -> bpy.types.Object:
+    """An armature object with the bones of a rig, which becomes the active one.
+
+    Raises:
+        InputError: a bone has no length.
+    """
+    armature = bpy.data.armatures.new(name)
+    armature_object = bpy.data.objects.new(name, armature)
+    collection.objects.link(armature_object)
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    for b, bone_name in enumerate(rig.names):
+        length = float(np.linalg.norm(rig.tail_m[b] - rig.head_m[b]))
+        if length < SHORTEST_M:
+            bpy.ops.object.mode_set(mode="OBJECT")
+            raise InputError(f"The bone “{bone_name}” has no length; give it one in the source.")
+        bone = armature.edit_bones.new(bone_name)
+        bone.head, bone.tail = rig.head_m[b], rig.head_m[b] + length * rig.R_rest[b][:, 1]
+        bone.align_roll(Vector(rig.R_rest[b][:, 2]))
+        if rig.parents[b] >= 0:
+            bone.parent = armature.edit_bones[rig.names[rig.parents[b]]]
+    bpy.ops.object.mode_set(mode="OBJECT")
     return armature_object
 
 

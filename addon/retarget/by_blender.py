@@ -49,12 +49,11 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     """
     if kind == "abc" and not out.is_dir():
         raise InputError(NO_MESHES)
-    if out.is_dir():
-        shape, of_run = skin.skin_of_run(out)
-        motion = with_digits(motion, shape)
-    motion = programs.rooted(motion, program)
+    made = skin.skin_of_run(out) if out.is_dir() else None
+    motion = programs.rooted(with_digits(motion, made[0]) if made else motion, program)
     with _plain_armature(kind, file, program, motion) as armature_object:
-        if out.is_dir():
+        if made:
+            shape, of_run = made
             picture = out / "skin" / TEXTURE if of_run is not None else None
             skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run, texture=picture)
             skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))

@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.add_robot(): a character to try retargeting on, and how it follows a body in the sample."""
+"""bpy.ops.tricap.add_robot(): a character to try retargeting on, and how it follows the sample's body."""
 
 import bpy
 import numpy as np
@@ -9,6 +9,7 @@ from ...core.motion.retarget.retarget import RetargetSettings, begun_at_rest
 from ...core.synthetic.robot import Robot, robot
 from ..panels import TellingOperator
 from . import apply
+from .build import armature_of_rig
 from .operators import compute
 from .read import action_frames, read_motion, read_rig
 
@@ -36,15 +37,7 @@ def add_robot(context: bpy.types.Context) -> bpy.types.Object:
         bpy.ops.object.mode_set(mode="OBJECT")
     collection = bpy.data.collections.new(NAME)
     context.scene.collection.children.link(collection)
-    rig = bpy.data.objects.new(NAME, bpy.data.armatures.new(NAME))
-    collection.objects.link(rig)
-    context.view_layer.objects.active = rig
-    bpy.ops.object.mode_set(mode="EDIT")
-    for name, parent, head, tail in zip(built.names, built.parents, built.head_m, built.tail_m):
-        bone = rig.data.edit_bones.new(name)
-        bone.head, bone.tail = head, tail
-        bone.parent = rig.data.edit_bones[parent] if parent else None
-    bpy.ops.object.mode_set(mode="OBJECT")
+    rig = armature_of_rig(built.rig, NAME, collection)
     rig.show_in_front, rig.data.display_type = True, "STICK"
     _add_mesh(rig, collection, built)
     context.view_layer.objects.active = active
@@ -66,11 +59,11 @@ def _add_mesh(rig: bpy.types.Object, collection: bpy.types.Collection, built: Ro
     mesh.update()
     body = bpy.data.objects.new(f"{NAME} Mesh", mesh)
     collection.objects.link(body)
-    bind(body, rig, built.names, np.eye(len(built.names))[built.bone])
+    bind(body, rig, built.rig.names, np.eye(len(built.rig.names))[built.bone])
 
 
-def follow(target: bpy.types.Object, source: bpy.types.Object) -> str:
-    """Let a target move like an armature, beside it; how well, as a sentence.
+def follow(target: bpy.types.Object, source: bpy.types.Object) -> None:
+    """Let a target move like an armature, beside it.
 
     Raises:
         InputError: one of them cannot be mapped.
@@ -78,7 +71,7 @@ def follow(target: bpy.types.Object, source: bpy.types.Object) -> str:
     motion, onto = read_motion(source, read_rig(source), action_frames(source)), apply.read_target(target)
     found = compute(lambda: motion, onto, RetargetSettings(), FeetSettings(), Monitor())
     beside = begun_at_rest(found.result, found.source)
-    return str(apply.apply(target, found.source, onto, beside, f"{source.name} on {target.name}").figures)
+    apply.apply(target, found.source, onto, beside, f"{source.name} on {target.name}")
 
 
 CLASSES = (AddRobot,)

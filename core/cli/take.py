@@ -11,9 +11,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..images.sequence import movie_rate
 from ..take.bar_file import read_bar, write_bar
-from ..take.writing import footage_entry, make_take, new_table, take_of_table
-
-ASSUMED_FPS = 25.0  # of images, of which nobody says how many a second there are
+from ..take.writing import ASSUMED_FPS, footage_entry, make_take, new_table, take_of_table
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -51,5 +49,5 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model and take.body_model not in START_ALONE else []
     lines = [f"{folder}: a take of {len(views)} views, {fps:.6g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."]
     if args.fps is None and not stated:
-        lines.append(f"Images state no frame rate, so {fps:g} is assumed; if it is another, correct `fps` in {folder / 'take.toml'}.")
+        lines.append(f"The footage states no frame rate, so {fps:g} is assumed; if it is another, correct `fps` in {folder / 'take.toml'}.")
     return lines

@@ -94,15 +94,14 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         changed = _changed(before.get("clicks", {}), now["clicks"])
         if not changed:
             raise InputError("No joints were clicked or pulled since the body was fitted; drag a joint first.")
-        model = _model_of(take, record["stages"]["fit"])
-        body = _Body.read(results)
+        body = _Body.read(results, _fitted_model(take, record["stages"]["fit"]))
         stretches = around([*changed], body.motion.frames, body.motion.time_s)
         if not stretches:
             return None
         parts = []
         for i, rows in enumerate(stretches):
             joints = {name for frame, names in changed.items() if frame in body.motion.frames[rows] for name in names}
-            parts.append(_fitted(footage, results, settings, body, rows, joints, model, monitor.part("fit", i, len(stretches))))
+            parts.append(_fitted(footage, results, settings, body, rows, joints, monitor.part("fit", i, len(stretches))))
         _write(results, settings["skin"], body, parts)
         again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
         record["stages"]["fit"] |= {FITTED_WITH: now, AGAIN: again}
@@ -116,7 +115,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
     )
 
 
-def _model_of(take: Take, fit: Mapping[str, Any]) -> str:
+def _fitted_model(take: Take, fit: Mapping[str, Any]) -> str:
     """The model of the fitted body: the take's, or the one that the `fit` of run.json chose.
 
     Raises:
@@ -151,14 +150,15 @@ def _changed(before: Digests, now: Digests) -> dict[int, list[str]]:
 class _Body:
     """The results of the earlier fit."""
 
+    model: str
     shape: BodyShape
     motion: MotionTable
     joints: JointTable
     table: FrameTable
 
     @staticmethod
-    def read(results: Results) -> "_Body":
-        """From the folder of results.
+    def read(results: Results, model: str) -> "_Body":
+        """From the folder of results, of a body of this model.
 
         Raises:
             InputError: a file is missing or damaged, or the tables have other frames.
@@ -169,7 +169,7 @@ class _Body:
         same = all(np.array_equal(other.frames, motion.frames) for other in (joints, table))
         if not same or set(joints.joints_m) != set(shape.skeleton.joint_names) or not all(map(all, joints.known.values())):
             raise InputError(f"The tables in {results.folder} do not belong together; run the whole fit again.")
-        return _Body(shape=shape, motion=motion, joints=joints, table=table)
+        return _Body(model=model, shape=shape, motion=motion, joints=joints, table=table)
 
     @property
     def earlier(self) -> EarlierFit:
@@ -202,14 +202,7 @@ class _Body:
 
 
 def _fitted(
-    footage: Footage,
-    results: Results,
-    settings: Mapping[str, Any],
-    body: _Body,
-    rows: range,
-    joints: set[str],
-    model: str,
-    monitor: Monitor,
+    footage: Footage, results: Results, settings: Mapping[str, Any], body: _Body, rows: range, joints: set[str], monitor: Monitor
 ) -> BodyMotion:
     """The new motion of some rows of the earlier one."""
     fitting, wider = settings["fitting"], with_held(rows, len(body.motion.frames))
@@ -226,7 +219,7 @@ def _fitted(
     background = background_regions(footage, results, clouds, fitting, monitor, wider)
     part = replace(footage, frames=footage.frames[wider.start : wider.stop])
     chosen = clouds_for_fit(part, [clouds[row] for row in wider], trajectories, background, fitting, results, monitor)
-    given = of_model(fit_input(part, chosen, trajectories, results, background), model)
+    given = of_model(fit_input(part, chosen, trajectories, results, background), body.model)
     return fit_again(given, body.earlier, rows, joints, fitting, monitor)
 
 

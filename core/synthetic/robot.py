@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.rotation import shortest
+from ..motion.retarget.rig import Rig
+
 # Bones, parents first, in a T-pose that faces −Y, with the left side at +X: name, parent, head and tail [m]. Those with `.L` stand for
 # both sides.
 BONES = (
@@ -54,10 +57,7 @@ ROUND = 0.35  # exponent of the solids: 1 is an ellipsoid, 0 a box
 class Robot:
     """B bones, and V vertices of quads, each of which moves with one bone."""
 
-    names: tuple[str, ...]  # parents first
-    parents: tuple[str, ...]  # "" for none
-    head_m: np.ndarray  # (B, 3)
-    tail_m: np.ndarray  # (B, 3)
+    rig: Rig
     vertices_m: np.ndarray  # (V, 3)
     bone: np.ndarray  # (V,)
     faces: np.ndarray  # (F, 4)
@@ -72,6 +72,7 @@ def robot() -> Robot:
         for side in _sides(name)
     ]
     names = tuple(name for name, *_ in bones)
+    heads, tails = np.array([head for *_, head, _ in bones]), np.array([tail for *_, tail in bones])
     cube, quads = _rounded_cube()
     vertices, owners, faces, dark = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     for name, middle, half, is_dark in SOLIDS:
@@ -81,10 +82,15 @@ def robot() -> Robot:
             owners.append(np.full(len(cube), names.index(_on(side, name))))
             dark.append(np.full(len(quads), is_dark))
     return Robot(
-        names=names,
-        parents=tuple(parent for _, parent, *_ in bones),
-        head_m=np.array([head for *_, head, _ in bones]),
-        tail_m=np.array([tail for *_, tail in bones]),
+        rig=Rig(
+            names=names,
+            parents=np.array([names.index(parent) if parent else -1 for _, parent, *_ in bones]),
+            R_rest=shortest(np.array([0.0, 1.0, 0.0]), tails - heads),
+            head_m=heads,
+            tail_m=tails,
+            connected=np.zeros(len(names), dtype=bool),
+            inherits_rotation=np.ones(len(names), dtype=bool),
+        ),
         vertices_m=np.concatenate(vertices),
         bone=np.concatenate(owners),
         faces=np.concatenate(faces),

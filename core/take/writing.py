@@ -20,9 +20,10 @@ from .take import FORMAT, VERSION, Take, take_of_text
 Link = tuple[Path, Path]  # its path in the take's folder, and the footage that it leads to
 Table = dict[str, Any]
 DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # that a file may leave out
+ASSUMED_FPS = 25.0  # of footage that states no frame rate, where nobody says it either
 
 
-def new_table(views: Sequence[Table], *, fps: float = 25.0, interlaced: str = "none", model: str | None = None) -> Table:
+def new_table(views: Sequence[Table], *, fps: float = ASSUMED_FPS, interlaced: str = "none", model: str | None = None) -> Table:
     """The table of a new take.toml; `views` as in [[views]]."""
     table: Table = {"format": FORMAT, "version": VERSION, "fps": fps, "interlaced": interlaced, "rig": "rig.toml", "views": [*views]}
     return table | ({"body": {"model": model}} if model else {})

@@ -56,6 +56,7 @@ def armature(rig: Any, name: str) -> Any:
 
 def test_a_robot_to_try_it_on(blender: ModuleType) -> None:
     """The button adds a target, which the next press lets move; what was active and selected stays, also in pose mode."""
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     source = armature(person(), "Person")
     blender.context.view_layer.objects.active = source
     chosen = set(blender.context.selected_objects)

@@ -326,7 +326,7 @@ def test_new_takes_the_movies_frame_rate_and_says_what_it_assumes(take: Path, tm
     for made, views, more, fps, said in (
         ("movies", movies, [], 29.97, "29.97 images per second. Next"),
         ("told", movies, ["--fps", "60"], 60.0, "60 images per second. Next"),
-        ("images", images, [], 25.0, "Images state no frame rate, so 25 is assumed"),
+        ("images", images, [], 25.0, "The footage states no frame rate, so 25 is assumed"),
         ("told too", images, ["--fps", "25"], 25.0, "25 images per second. Next"),
     ):
         assert main.main(["new", str(tmp_path / made), "--views", *views, *more]) == 0
