@@ -21,6 +21,7 @@ from .errors import InputError
 
 NEW_FILE = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 HEADER = "header_json"
+CONTENT = "content"  # of the header: a digest of the arrays, which files of earlier versions lack
 STORE_VERSION = 1
 LARGEST_UNPACKED = 400_000_000  # bytes to which any file may unpack
 LARGEST_RATIO = 100  # times its size, for larger files
@@ -125,7 +126,8 @@ def read_json(path: Path) -> Any:
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:
     """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
-    text = json.dumps({"store_version": STORE_VERSION, "arrays": sorted(arrays), **header}, sort_keys=True, allow_nan=False)
+    own = {"store_version": STORE_VERSION, "arrays": sorted(arrays), CONTENT: _content(arrays)}
+    text = json.dumps({**own, **header}, sort_keys=True, allow_nan=False)
     write = np.savez_compressed if compress else np.savez
     with written(path) as file:
         write(file, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
@@ -148,7 +150,15 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise InputError(f"{path} was written by another version of Tricap; remove it and run again.")
     if header.pop("arrays", sorted(arrays)) != sorted(arrays):
         raise InputError(f"{path} is damaged: it lacks a part; remove it and run again.")
+    if header.get(CONTENT, content := _content(arrays)) != content:
+        raise InputError(f"{path} is damaged: it was changed after it was written; remove it and run again.")
     return arrays, header
+
+
+def _content(arrays: Mapping[str, np.ndarray]) -> str:
+    """A digest of arrays: their names, types, shapes and values."""
+    parts = [(name, np.asarray(array)) for name, array in sorted(arrays.items())]
+    return digest(*(part for name, a in parts for part in (f"{name} {a.dtype.str} {a.shape}", np.ascontiguousarray(a).tobytes())))
 
 
 def header_of(path: Path) -> dict[str, Any]:

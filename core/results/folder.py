@@ -122,7 +122,7 @@ class Results:
         return self.path("clouds", f"{frame:04d}.ply")
 
     def load_checkpoint(self, stage: str, name: str, key: str) -> dict[str, np.ndarray] | None:
-        """The arrays of a checkpoint, or None when it is missing, damaged, or made from other input."""
+        """The arrays of a checkpoint, or None when it is missing, damaged, changed by somebody, or made from other input."""
         path = self.path("cache", stage, f"{name}.npz")
         if not path.exists():
             return None
@@ -130,7 +130,7 @@ class Results:
             arrays, header = store.load(path)
         except InputError:
             return None  # a damaged checkpoint is computed again
-        return arrays if header.get("key") == key else None
+        return arrays if header.get("key") == key and store.CONTENT in header else None
 
     def has_checkpoint(self, stage: str, name: str, key: str) -> bool:
         """Whether there is a checkpoint from this input; its arrays are not read."""

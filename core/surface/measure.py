@@ -175,11 +175,10 @@ def last_cloud(footage: Footage, results: Results, frame: int) -> PointCloud:
         InputError: its checkpoint is missing or damaged.
     """
     path = results.path("cache", "surface", f"{frame:04d}.npz")
-    try:
-        arrays, header = store.load(path)
-        return _measured(footage, frame, str(header["key"]), arrays).cloud
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"The checkpoint {path} is damaged: run the whole fit again.") from error
+    found = read_checkpoint(footage, results, frame, str(store.header_of(path).get("key")))
+    if found is None:
+        raise InputError(f"The checkpoint {path} is missing or damaged: run the whole fit again.")
+    return found.cloud
 
 
 def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) -> MeasuredFrame | None:

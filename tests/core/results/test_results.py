@@ -1,5 +1,6 @@
 """The folder of a run: checkpoints that agree or are made anew, run.json, and folders that belong to somebody else."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,18 @@ def test_a_damaged_checkpoint_is_made_anew(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"text", whole.replace(b"x.npy", b"y.npy")):
         path.write_bytes(content)
+        assert results.load_checkpoint("surface", "0000", "k") is None
+
+
+@pytest.mark.parametrize("forged", [np.zeros(3), np.full((2, 3), np.nan), np.zeros((2, 3), dtype=complex), np.full((2, 3), "x")])
+def test_a_checkpoint_that_somebody_changed_is_made_anew(tmp_path: Path, forged: np.ndarray) -> None:
+    results, path = Results(tmp_path), tmp_path / "cache" / "surface" / "0000.npz"
+    for hide in (False, True):  # also with a header that does not say what the arrays were
+        results.save_checkpoint("surface", "0000", "k", ARRAYS)
+        file = store.load_arrays(path)
+        header = json.loads(str(file["header_json"]))
+        header = {name: value for name, value in header.items() if not (hide and name == store.CONTENT)}
+        np.savez(path, **(file | {"header_json": np.array(json.dumps(header)), "x": forged}))  # type: ignore[arg-type]
         assert results.load_checkpoint("surface", "0000", "k") is None
 
 
