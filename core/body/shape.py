@@ -188,6 +188,11 @@ def write_body(path: Path, shape: BodyShape) -> None:
     Raises:
         InputError: the file cannot be written.
     """
+    store.write_text(Path(path), body_text(shape))
+
+
+def body_text(shape: BodyShape) -> str:
+    """The text of body.toml."""
     skeleton = shape.skeleton
     lines = ['format = "tricap-body"', "version = 1", f"model = {_text(shape.model)}", f"base = {_text(skeleton.bones[0].head_joint)}", ""]
     for bone, length, sigma in zip(skeleton.bones, shape.lengths_m, shape.length_sigma_m):
@@ -220,7 +225,7 @@ def write_body(path: Path, shape: BodyShape) -> None:
             *([f"weight_sigma = {float(shape.weight_sigma[i])!r}"] if shape.weight_sigma is not None else []),
             "",
         ]
-    store.write_text(Path(path), "\n".join(lines))
+    return "\n".join(lines)
 
 
 def read_body(path: Path) -> BodyShape:
@@ -230,10 +235,21 @@ def read_body(path: Path) -> BodyShape:
         InputError: the file is missing, is not a body.toml of this version, or lacks an entry.
     """
     try:
-        table = bounded.toml_of(bounded.text_of(path, bounded.TOML_BYTES))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"Cannot read the body {path}: {reason}; run the fit again.") from error
+        return body_of(bounded.text_of(path, bounded.TOML_BYTES), str(path))
+    except OSError as error:
+        raise InputError(f"Cannot read the body {path}: {error.strerror or error}; run the fit again.") from error
+
+
+def body_of(text: str, path: str = "of a checkpoint") -> BodyShape:
+    """The body of a text of body.toml; `path` for messages.
+
+    Raises:
+        InputError: see `read_body`.
+    """
+    try:
+        table = bounded.toml_of(text)
+    except ValueError as error:
+        raise InputError(f"Cannot read the body {path}: {error}; run the fit again.") from error
     if table.get("format") != "tricap-body" or table.get("version") != 1:
         raise InputError(f"{path} is not a body.toml of this version of Tricap; run the fit again.")
     try:

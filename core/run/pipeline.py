@@ -4,6 +4,7 @@ Every stage asks the stages before it for their results. What has a checkpoint i
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from ..body.skin.texture import TextureBaker
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
+from ..fitting.inputs.background import BackgroundDistances
 from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
@@ -32,7 +34,7 @@ from ..fitting.inputs.start_joints import NeedsClick
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_and_start, fit_from
-from ..fitting.stages.set_up import NobodyFound, with_start
+from ..fitting.stages.set_up import NobodyFound, of_model, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching.foreground import Foreground
@@ -56,6 +58,7 @@ from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds
 from .around_clicks import FITTED_WITH, fitted_with
 from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .engine import Engine
+from .fitted_body import FittedBody, read_fitted, write_fitted
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
@@ -291,22 +294,35 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
     clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
     given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
-    given = with_start(given, fitting, monitor)
-    body, start = fit_and_start(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
-    tracked_again = dict[str, Any]()
-    loop = loop_of(fitting, body.shape.skeleton) if run.measured else OFF
-    if run.measured and (fitting.track_again or loop != OFF):
-        tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage))
-    if loop != OFF:
-        clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
-        contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
-        given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
-        body = fit_from(given, start, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"], "fit_again"))
+    if (fitted := read_fitted(run.results, run.body_key)) is not None:
+        given, body, tracked_again = replace(of_model(given, fitted.model), start=fitted.start), fitted.body, dict[str, Any]()
+    else:
+        given, body, tracked_again = _fit_to(run, given, background, monitor)
     run.body = body = _write_body(run, body, monitor)
     run.results.remove("cache/fit", "cache/fit_again")
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     skin_at = skin_in(run.results.path("skin"), body, run.settings["skin"])
     run.silhouettes = silhouettes_of(run.footage, body, skin_at, outlines, background, monitor)
+    return given, body, tracked_again
+
+
+def _fit_to(
+    run: Run, given: FitInput, background: Sequence[BackgroundDistances], monitor: Monitor
+) -> tuple[FitInput, BodyFit, dict[str, Any]]:
+    """Fit the body, and track once more with its help; a body whose trajectories stay has a checkpoint."""
+    fitting = run.settings["fitting"]
+    given = with_start(given, fitting, monitor)
+    body, start = fit_and_start(given, fitting, monitor, FitCheckpoints(run.results, run.body_key))
+    loop = loop_of(fitting, body.shape.skeleton) if run.measured else OFF
+    if not (run.measured and (fitting.track_again or loop != OFF)):
+        write_fitted(run.results, run.body_key, FittedBody(body=body, model=given.model, start=given.start))
+        return given, body, {}
+    tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage))
+    if loop != OFF:
+        clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
+        contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
+        given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
+        body = fit_from(given, start, fitting, monitor, FitCheckpoints(run.results, run.body_key, "fit_again"))
     return given, body, tracked_again
 
 

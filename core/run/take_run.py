@@ -9,6 +9,7 @@ from typing import Any
 
 from ..body.model_file import read_model
 from ..body.motion import BodyFit
+from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
@@ -37,6 +38,7 @@ class Run:
     settings: dict[str, Any]
     results: Results
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
+    body_key: str = ""  # that of the fit, whatever the skin
     record: dict[str, Any] = field(default_factory=dict)
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
@@ -136,7 +138,7 @@ def open_run(
         read_model(take.joints_model)
     check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
     check_pictured(footage.frames, pictures)
-    keys = stage_keys(footage, settings, Path(out))
+    keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
     with Results(out).opened() as results:
         if restart:
             results.remove("run.json", "clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
@@ -146,7 +148,7 @@ def open_run(
         record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
         if before:  # what was made otherwise must not stand beside the new
             results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
-        yield Run(footage=footage, settings=settings, results=results, keys=keys, record=record, pictured=pictures)
+        yield Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
 
 
 def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:

@@ -1,0 +1,77 @@
+"""The fitted body as a checkpoint (cache/body): another skin does not fit it anew, nor does a run that was stopped at its skin."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ..body.motion import BodyFit, BodyMotion
+from ..body.shape import body_of, body_text
+from ..fitting.inputs.start_joints import StartJoints
+from ..results.folder import Results
+
+STAGE, NAME = "body", "fitted"
+OF_SHAPE = ("dof_names", "joint_names")  # of the motion: they follow from the skeleton
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedBody:
+    """What the fit found, before a skin is made."""
+
+    body: BodyFit
+    model: str  # that was fitted; the take's, or the chosen one
+    start: StartJoints | None  # found without clicks
+
+
+def write_fitted(results: Results, key: str, fitted: FittedBody) -> None:
+    """Write the checkpoint."""
+    body, start = fitted.body, fitted.start
+    motion = {f.name: np.array(getattr(body.motion, f.name)) for f in fields(BodyMotion) if f.name not in OF_SHAPE}
+    values = dict(
+        shape=body_text(body.shape),
+        iterations=body.iterations,
+        converged=body.converged,
+        contradicted=body.contradicted,
+        model=fitted.model,
+        start=None if start is None else _start_table(start),
+    )
+    arrays = {"points": body.points, "outline_m": body.outline_m, "values_json": np.array(json.dumps(values))}
+    results.save_checkpoint(STAGE, NAME, key, {**arrays, **{f"motion_{name}": array for name, array in motion.items()}})
+
+
+def read_fitted(results: Results, key: str) -> FittedBody | None:
+    """The body that was fitted to the same input; None where there is none, or it is damaged.
+
+    Raises:
+        InputError: it has a shape of an earlier version.
+    """
+    arrays = results.load_checkpoint(STAGE, NAME, key)
+    if arrays is None:
+        return None
+    values = json.loads(str(arrays["values_json"]))
+    shape = body_of(values["shape"])
+    motion: dict[str, Any] = {f.name: arrays[f"motion_{f.name}"] for f in fields(BodyMotion) if f.name not in OF_SHAPE}
+    motion |= dict(known=tuple(map(tuple, motion["known"].tolist())), status=tuple(motion["status"].tolist()))
+    body = BodyFit(
+        shape=shape,
+        motion=BodyMotion(dof_names=shape.skeleton.dof_names, joint_names=shape.skeleton.joint_names, **motion),
+        iterations=values["iterations"],
+        converged=values["converged"],
+        points=arrays["points"],
+        outline_m=arrays["outline_m"],
+        contradicted={bone: tuple(frames) for bone, frames in values["contradicted"].items()},
+    )
+    start = None if values["start"] is None else _start(values["start"])
+    return FittedBody(body=body, model=values["model"], start=start)
+
+
+def _start_table(start: StartJoints) -> dict[str, Any]:
+    table = {f.name: getattr(start, f.name) for f in fields(StartJoints)}
+    return table | {"xyz_m": {name: xyz.tolist() for name, xyz in start.xyz_m.items()}}
+
+
+def _start(table: Mapping[str, Any]) -> StartJoints:
+    start = StartJoints(**table)
+    return replace(start, xyz_m={name: np.array(xyz) for name, xyz in table["xyz_m"].items()}, unsure=tuple(table["unsure"]))
