@@ -39,6 +39,9 @@ WORDS = (struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pa
          struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack("<d", float("nan")),
          struct.pack("<d", 1e308), struct.pack(">I", 0x00FFFFFF),
          b"\0" * 8, struct.pack("<I", 1 << 24))  # fmt: skip
+TEXTS = (b'"\\u0000"', b'"../x"', b'"/"', b'"."', b'""', b'"\\u001b[31m"', b'"a/b.toml"')
+KEYS = (b"movie", b"images", b"mask", b"masks", b"background", b"timestamps", b"fps", b"start", b"affinity", b"distortions", b"fisheye",
+        b"kind", b"frame", b"frames", b"model", b"sigma", b"name", b"view", b"xy", b"polygon", b"joints", b"surface")  # fmt: skip
 NODES: tuple[Any, ...] = (None, True, "", "9" * 5000, "\u00b2", "1e999", -1, 2**80, 1e308, -0.5, [], {}, [[1], 2], {"a": []}, ["x"] * 3000)
 NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ", b"a.", b"{a=", b"data: [", b"JOINT a {", b"[[a.", b'"\\u0041".')
 TOWERS = ((b"[", b"]"), (b'{"a":', b"}"), (b"<a>", b"</a>"), (b"data: [", b"]"), (b"{a=", b"}"), (b"{a: ", b"}"), (b"a.", b""),
@@ -93,6 +96,22 @@ def _name(data: bytes, r: random.Random) -> bytes:
         return _word(data, r)
     m, n = r.choice(found), r.choice(found)
     return data[: m.start()] + (n.group() if r.random() < 0.7 else b"constructor\xc3\xa9") + data[m.end() :]
+
+
+def _text(data: bytes, r: random.Random) -> bytes:
+    """A quoted text becomes another one, or something else."""
+    found = list(re.finditer(rb'"[^"\n]*"', data[:200_000]))
+    if not found:
+        return _name(data, r)
+    m = r.choice(found)
+    return data[: m.start()] + r.choice(TEXTS + KINDS + NUMBERS) + data[m.end() :]
+
+
+def _key(data: bytes, r: random.Random) -> bytes:
+    """One more line of TOML, with a key that files have, and any value."""
+    lines = data.split(b"\n")
+    lines.insert(r.randrange(len(lines)) + 1, r.choice(KEYS) + b" = " + r.choice(TEXTS + KINDS + NUMBERS + (b"[1]", b"[-1.0, 0.0]")))
+    return b"\n".join(lines)
 
 
 def _lines(data: bytes, r: random.Random) -> bytes:
@@ -230,7 +249,8 @@ def _sound_sums(data: bytes, r: random.Random) -> bytes:
 
 
 DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _node, _node, _all_different, _insert, _deep, _deep,
+    _cut, _flip, _flip, _word, _word, _value, _value, _value, _text, _text, _key, _key, _name, _lines, _node, _node, _all_different,
+    _insert, _deep, _deep,
     _indented, _encoded, _spelled, _spelled, _packed, _nothing, _sound_sums)  # fmt: skip
 
 

@@ -20,11 +20,12 @@ from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import REST, read_skin, rest_skin, write_skin
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
+from tricap.core.checking.rig_check import geometry_findings
 from tricap.core.checking.run_check import check_run
 from tricap.core.foundation import bounded, store
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
-from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.images.interlace import row_grid
 from tricap.core.images.sequence import open_sequence
 from tricap.core.motion import tables
@@ -37,17 +38,20 @@ from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.residual_motion import ResidualChain, ResidualMotion, from_text, to_text
 from tricap.core.motion.retarget.roles import read_humanoid
 from tricap.core.networks.onnx_file import input_shape, read_onnx
+from tricap.core.report.pictures import png
 from tricap.core.results.folder import Results
 from tricap.core.run import record as frame_table
 from tricap.core.run.inspection import patch_boxes, read_removed, read_tracks
 from tricap.core.run.inspection import read_points as read_shown
-from tricap.core.run.stages import valid_stages
+from tricap.core.run.settings import settings_of
+from tricap.core.run.stages import stage_keys, valid_stages
 from tricap.core.run.take_run import Run
 from tricap.core.synchronising.sound import read_wav
 from tricap.core.synchronising.time_code import read_time_code
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take.bar_file import read_bar, write_bar
 from tricap.core.take.clock import read_timestamps
+from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 from tricap.core.tracking.contour import ContourTable
@@ -87,6 +91,23 @@ surface = [ { L = [20.0, 24.0], C = [55.0, 38.0] } ]
 [settings.matching]
 patch_px = 13
 """
+
+
+def films(folder: Path) -> list[Path]:
+    """A take with images, which is opened, and not only read."""
+    for k, view in enumerate("LC"):
+        (folder / view).mkdir()
+        for n in range(6):
+            store.write_bytes(folder / view / f"{n:04d}.png", png(np.full((72, 96), 40 + 9 * n + k, dtype=np.uint8)))
+    write_rig(folder / "rig.toml", Rig(cameras=RIG.cameras[:2]))
+    (folder / "take.toml").write_text(TAKE.replace('movie = "c.mp4"', 'images = "C/*.png"'))
+    return [folder / "take.toml", folder / "rig.toml"]
+
+
+def opened(folder: Path) -> None:
+    footage = open_take(read_take(folder))
+    stage_keys(footage, settings_of(footage.take.settings, {}, "take.toml"), folder / "out")
+    footage.read(footage.frames.start)
 
 
 def kept_motion(folder: Path) -> None:
@@ -163,7 +184,7 @@ def calibration(kind: str) -> tuple[Make, Read]:
     def make(folder: Path) -> list[Path]:
         return [p for p in write_as(folder / name, RIG, kind) if p.is_file()]
 
-    return make, lambda folder: read_any(folder / name)
+    return make, lambda folder: geometry_findings(read_any(folder / name))
 
 
 def picture(ending: str, dtype: type = np.uint8, shape: tuple[int, ...] = (24, 32)) -> tuple[Make, Read]:
@@ -354,7 +375,8 @@ def skin_of_rest(folder: Path) -> list[Path]:
 
 READERS: dict[str, tuple[Make, Read]] = {
     "take.toml": (text("take.toml", TAKE), read_take),
-    "rig.toml": (written("rig.toml", lambda p: write_rig(p, RIG)), lambda f: read_rig(f / "rig.toml")),
+    "rig.toml": (written("rig.toml", lambda p: write_rig(p, RIG)), lambda f: geometry_findings(read_rig(f / "rig.toml"))),
+    "opened take": (films, opened),
     **{f"calibration {kind}": calibration(kind) for kind in sorted(FORMATS)},
     "ply": (cloud, lambda f: [read_ply(f / "a.ply"), read_ply(f / "b.ply")]),
     "network": (written("a.onnx", lambda p: p.write_bytes(pose_graph("simcc", 17, (32, 32)))),

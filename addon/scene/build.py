@@ -209,6 +209,8 @@ def save_blend(path: Path) -> None:
     path = real_place(path)
     if path.suffix != ".blend":
         raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the Blender file another name.")
     part = store.part_of(path)
     try:
         store.try_writing(part)

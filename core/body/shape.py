@@ -236,8 +236,9 @@ def read_body(path: Path) -> BodyShape:
     """
     try:
         return body_of(bounded.text_of(path, bounded.TOML_BYTES), str(path))
-    except OSError as error:
-        raise InputError(f"Cannot read the body {path}: {error.strerror or error}; run the fit again.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"Cannot read the body {path}: {reason}; run the fit again.") from error
 
 
 def body_of(text: str, path: str = "of a checkpoint") -> BodyShape:

@@ -15,6 +15,7 @@ from ..foundation.errors import InputError
 MOST_DIGITS = 12  # of a frame number
 OUTPUTS = ("printed", "preview", "blend", "file", "report", "pictures")  # arguments that name what is written
 WITH_OUT = ("calibrate", "track2d", "fields")  # commands with a file, or some, for --out; those with a folder for a run check that
+WITH_RESULTS = ("measure", "track", "fit", "run", "contour")  # commands that replace files of their folder --out
 
 
 def overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
@@ -89,7 +90,9 @@ def check_outputs(args: argparse.Namespace) -> None:
     from ..results import outputs
 
     names = (*OUTPUTS, "out") if args.command in WITH_OUT else OUTPUTS
-    outputs.check_outputs(vars(args), names, may_be_rig=args.command == "calibrate")
+    values = {name: value for name, value in vars(args).items() if name not in args.words}
+    results = args.out if args.command in WITH_RESULTS else None
+    outputs.check_outputs(values, names, may_be_rig=args.command == "calibrate", results=results)
 
 
 def check_simplify(degrees: float) -> None:

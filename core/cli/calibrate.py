@@ -13,7 +13,7 @@ from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import Start, Starts, calibrate_rig, measure_bar, open_bar, open_boards, write_report
-from ..calibration.rig_files import read_any, write_as
+from ..calibration.rig_files import FOLDERS, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
@@ -86,6 +86,8 @@ def _print(args: argparse.Namespace, board: Board | None) -> list[str]:
 def _convert(args: argparse.Namespace) -> list[str]:
     if args.format:
         check_not_read("--out", args.out, args.source)
+        if any(args.source.match(name) for name in FOLDERS.get(args.format, ())):
+            check_not_read("--out", args.out, args.source.parent)
     rig = read_any(args.source)
     world = _world(args)
     if world.floor_frames or world.level_frames:

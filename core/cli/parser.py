@@ -8,7 +8,7 @@ import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from ..body.model_file import model_names
 from ..foundation.progress import Monitor
@@ -44,6 +44,10 @@ class _Parser(argparse.ArgumentParser):
         """Write the help text; raises an InputError where that fails."""
         streams.write(self.format_help(), sys.stdout if file is None else file)
 
+    def error(self, message: str) -> NoReturn:
+        """As argparse does, but no argument steers the terminal."""
+        super().error(streams.visible(message))
+
 
 def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
@@ -54,6 +58,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     for sub in commands.choices.values():
         for argument in sub._actions:
             argument.type = named_path if argument.type is Path else argument.type
+        sub.set_defaults(words={argument.dest for argument in sub._actions if argument.choices})  # that name no file
         sub.add_argument("--quiet", action="store_true", help="show errors and findings only")
     return parser
 

@@ -48,6 +48,8 @@ def opened(path: Path, largest: int) -> Iterator[BinaryIO]:
         OSError: it cannot be opened, is no regular file, or is larger than `largest` bytes.
     """
     path = Path(path)
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "no file has such a name", _shown(path))
     _check(path.stat(), path, largest)  # before it is opened: opening a pipe waits, opening a device may change it
     handle = os.open(path, os.O_RDONLY | _flag("O_BINARY") | _flag("O_CLOEXEC") | _flag("O_NONBLOCK"))
     with os.fdopen(handle, "rb") as file:

@@ -33,6 +33,7 @@ from .rotation import cross_matrix
 
 UNDISTORT_STEPS = 12  # of Newton's method
 UNDISTORT_TOLERANCE = 1e-12  # of normalised coordinates
+SAME_PX = 0.01
 NEAREST_M = 1e-6  # in front of the camera
 
 
@@ -118,6 +119,15 @@ class Camera:
         corners = self.directions(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
         radius = np.linalg.norm(corners[:, :2], axis=1)
         return float(np.where(np.isfinite(radius), radius, lens.FARTHEST).max() if self.fisheye else radius.max())
+
+    @property
+    def is_invertible(self) -> bool:
+        """Whether every point in the middle half of the image has a ray of its own: a lens that folds the image there is none."""
+        w, h = self.size_px
+        x, y = np.meshgrid(np.linspace(w / 4, 3 * w / 4, 9), np.linspace(h / 4, 3 * h / 4, 9))
+        xy = np.stack([x, y], axis=-1)
+        with np.errstate(all="ignore"):
+            return bool((np.abs(self._image(self.directions(xy)) - xy) < SAME_PX).all())
 
     def rays(self, xy_px: np.ndarray, steps: int = UNDISTORT_STEPS) -> np.ndarray:
         """Ray directions in the world (…, 3), scaled so that depth z_cam = 1 per unit; `steps` as in `directions`."""

@@ -17,6 +17,7 @@ from .camera import Camera
 from .rotation import rotation_from_vector, vector_from_rotation
 
 LARGEST_NUMBER = 1e12  # of a calibration in any unit; beyond it, powers of it overflow
+LARGEST_AFFINITY = 0.5  # pixels that are half as wide as the focal lengths say
 MOST_CAMERAS = 200  # much is done for every pair of them
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
@@ -76,11 +77,12 @@ def read_rig(path: Path) -> Rig:
 
 
 def check_cameras(cameras: Sequence[Camera], label: str) -> None:
-    """Check the number of cameras, and that their names are names, which messages, files of other tools and the scene use. `label` begins
-    the message.
+    """Check the number of cameras, that their names are names, which messages, files of other tools and the scene use, and that each can be
+    the camera of an image. `label` begins the message.
 
     Raises:
-        InputError: they are too many, two have the same name, or one is empty, has several lines or control characters.
+        InputError: they are too many, two have the same name, or one is empty, has several lines or control characters, or one has numbers
+            that no camera has.
     """
     if len(cameras) > MOST_CAMERAS:
         raise InputError(f"{label} has {len(cameras)} cameras; a rig has at most {MOST_CAMERAS}. Leave out those that are not used.")
@@ -91,6 +93,18 @@ def check_cameras(cameras: Sequence[Camera], label: str) -> None:
     unfit = next((name for name in names if not bounded.is_plain(name)), None)
     if unfit is not None:
         raise InputError(f"{label} has a camera of the name {shown(unfit)}; give it a name in one line, such as “L”.")
+    for camera in cameras:
+        if fault := _fault(camera):
+            raise InputError(f"{label} has a camera “{camera.name}” {fault}; calibrate it again.")
+
+
+def _fault(camera: Camera) -> str:
+    """What no camera has; empty for a possible one."""
+    if not all((np.abs(a) <= LARGEST_NUMBER).all() for a in (camera.matrix, camera.distortions, camera.t_cam_world_m)):
+        return f"with numbers beyond {LARGEST_NUMBER:.0e}"
+    if not (np.abs(camera.affinity) <= LARGEST_AFFINITY).all():
+        return f"whose affinity is beyond {LARGEST_AFFINITY}"
+    return "" if camera.is_invertible else "whose distortion folds the middle of the image"
 
 
 def sigmas_of(table: Any, name: str, path: Path) -> dict[str, float]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
@@ -36,6 +37,7 @@ CONTRAST_OVER_NOISE = 1.4  # and smallest ratio of it to the image's noise
 PATCH_STRIDE = 2  # px between the pixels that are compared
 DENSE_PATCH_PX = 9  # side of the largest patch of which all pixels are compared
 SWEEP_SMOOTHING_PX = 1.0  # px, sigma of the Gaussian: finer details would be noise to every other pixel
+LARGEST_SHAPE = 30.0  # pixels of a view over those of the reference
 MIN_SAMPLES = 8  # of a ray
 MAX_SAMPLES = 1200
 LOOK_UP = 30_000_000  # grey values interpolated per block
@@ -70,9 +72,12 @@ def _corners(base: Camera, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray) -
 
 
 def _image_of(camera: Camera, rows: RowGrid, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (…, 2) and shape (…, 2, 2) in one view of the patches with corners (…, 3, 3)."""
+    """Position (…, 2) and shape (…, 2, 2) in one view of the patches with corners (…, 3, 3); NaN for patches of an absurd shape, whose
+    pixels lie far outside of the image."""
     image = rows.from_frame(camera.project(corners))
-    return image[..., 0, :], np.stack([image[..., 1, :] - image[..., 0, :], image[..., 2, :] - image[..., 0, :]], axis=-1)
+    shape = np.stack([image[..., 1, :] - image[..., 0, :], image[..., 2, :] - image[..., 0, :]], axis=-1)
+    plausible = (np.abs(shape) <= LARGEST_SHAPE).all(axis=(-2, -1))
+    return np.where(plausible[..., None], image[..., 0, :], np.nan), shape
 
 
 def sweep_seeds(
@@ -91,6 +96,10 @@ def sweep_seeds(
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
     `near_px`, places (N, 2) and a distance (2,) in rows' pixels, only cells about these places are searched. With `pairs`, one search view
     is enough.
+
+    Raises:
+        InputError: the cameras are at the same position.
+        Cancelled: the user asked to stop.
     """
     xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
     if near_px is not None:
@@ -158,6 +167,8 @@ def _textured(views: Views, settings: MatchingSettings, xy: np.ndarray) -> np.nd
 def _default_range(views: Views) -> tuple[float, float]:
     centres = np.stack([views.cameras[k].centre_m for k in (views.reference, *views.search)])
     base = max(float(np.linalg.norm(a - b)) for a in centres for b in centres)
+    if base == 0:
+        raise InputError("The cameras are at the same position; depth needs a distance between them. Calibrate again.")
     return NEAREST_BASES * base, FARTHEST_BASES * base
 
 

@@ -69,10 +69,15 @@ def check_not_result(file: Path, out: Path) -> None:
     Raises:
         InputError: `file` is such a file.
     """
+    if bounded.real_path(file) == bounded.real_path(out) or is_result(file, out):
+        raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
+
+
+def is_result(file: Path, out: Path) -> bool:
+    """Whether a file in the folder `out` is one that a run writes there, the scene excepted."""
     path, read = bounded.real_path(file), bounded.real_path(out)
     own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
-    if path == read or set(own) & {*WRITTEN} - {"body.blend"}:
-        raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
+    return bool(set(own) & {*WRITTEN} - {"body.blend"})
 
 
 class Results:

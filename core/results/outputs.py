@@ -9,6 +9,7 @@ from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
 from ..take.footage_files import take_files
 from ..take.take import read_take
+from .folder import check_not_result, is_result
 
 LEVELS = 4  # so far above a file its take is looked for
 
@@ -23,8 +24,11 @@ def check_output(file: Path, inputs: Iterable[Path] = (), *, may_be_rig: bool = 
     for path in inputs:
         is_input = file.exists() and os.path.samefile(file, path)
         is_image = path.is_dir() and file.suffix.lower() in IMAGE_ENDINGS + MOVIE_ENDINGS and _holds(path, ways) and file.exists()
-        if is_input or (is_image and not (path / "run.json").exists()):
+        is_run = (path / "run.json").is_file()
+        if is_input or (is_image and not is_run):
             raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
+        if is_run:
+            check_not_result(file, path)
     for folder in {folder for way in ways for folder in (way, *way.parents[:LEVELS]) if (folder / "take.toml").is_file()}:
         _check_apart(file, ways, folder, may_be_rig)
     for folder in filter(None, map(_take_of_run, inputs)):
@@ -65,15 +69,19 @@ def _take_of_run(out: Path) -> Path | None:
         return None
 
 
-def check_outputs(values: dict[str, object], outputs: Sequence[str], *, may_be_rig: bool = False) -> None:
-    """`check_output` of the arguments of a command that are named `outputs`; all others with names of files are inputs.
+def check_outputs(values: dict[str, object], outputs: Sequence[str], *, may_be_rig: bool = False, results: Path | None = None) -> None:
+    """`check_output` of the arguments of a command that are named `outputs`; all others with names of files are inputs. `results`: the
+    folder OUT whose files the command replaces.
 
     Raises:
-        InputError: see there.
+        InputError: see there, or an input is one of these files.
     """
     texts = [text for name, value in values.items() if name not in outputs for text in (value if isinstance(value, list) else [value])]
     inputs = [Path(part) for text in texts if isinstance(text, (str, Path)) for part in {str(text), str(text).partition("=")[2]} if part]
     inputs = [path for path in inputs if _is_there(path)]
+    for path in inputs:
+        if results is not None and path.is_file() and is_result(path, results):
+            raise InputError(f"{path} is a result, which this command replaces; copy it to another folder and give the copy.")
     for name in outputs:
         file = values.get(name)
         if isinstance(file, Path):

@@ -20,7 +20,7 @@ import numpy as np
 from ..foundation import bounded
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError, shown
-from .sources import is_number
+from .sources import inside, is_number
 
 if TYPE_CHECKING:
     from ..images.sequence import ImageSequence
@@ -104,8 +104,8 @@ def view_clock(entry: Mapping[str, Any], label: str) -> dict[str, Any]:
     if not is_number(readout) or abs(readout) > LONGEST_READOUT_S:
         raise InputError(f"`readout` of {label} is {shown(readout)}; write the seconds from its first row to the last, such as 0.016.")
     stamps = entry.get("timestamps")
-    if stamps is not None and (not isinstance(stamps, str) or Path(stamps).is_absolute() or ".." in Path(stamps).parts):
-        raise InputError(f"`timestamps` of {label} is {shown(stamps)}; it must be a file inside the take's folder. Copy it there.")
+    if stamps is not None:
+        inside(Path(), stamps, label, "timestamps")
     numbers = {"start_s": float(start), "drift_ppm": float(drift), "readout_s": float(readout)}
     return {"fps": None if fps is None else float(fps), "timestamps": stamps, **numbers}
 

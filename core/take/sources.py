@@ -31,7 +31,7 @@ def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
 
 def inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
     """The path of a file that must lie in the take's folder."""
-    if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
+    if not isinstance(name, str) or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts:
         raise InputError(f"`{key}` of {where} is {shown(name)}; it must be a file inside the take's folder. Copy it there.")
     return folder / name
 

@@ -289,7 +289,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
             raise InputError(f"`offset_frames` of {label} is {shown(offset)}; write a whole number of frames, such as -2.")
         if not bounded.fits_file_names(entry["name"]):  # it is used in file names
             raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
-        if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
+        if sorted(map(type, (entry.get("images"), entry.get("movie"))), key=str) != [type(None), str]:
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         check_pattern(entry.get("images"), label)
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
@@ -333,7 +333,7 @@ def _corrections(tables: list[Mapping[str, Any]], views: tuple[str, ...], where:
 
 def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Correction:
     kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
-    if kind not in CORRECTIONS:
+    if not isinstance(kind, str) or kind not in CORRECTIONS:
         raise InputError(f"`kind` of {label} is {shown(kind)}; write one of: {', '.join(CORRECTIONS)}.")
     check_keys(table, ("kind", "view", *CORRECTIONS[kind]), label)
     if view not in views:

@@ -19,7 +19,11 @@ FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "pose2sim": toml_files.write_pose2sim,
 }
 WITH_FISHEYE = ("anipose", "pose2sim", "caliscope")  # that can hold OpenCV's fisheye lens
-FOLDERS = ("colmap", "easymocap", "openptv")  # written as several files into a folder
+FOLDERS = {  # formats of several files in a folder, and their names
+    "colmap": ("cameras.txt", "images.txt", "points3D.txt"),
+    "easymocap": ("intri.yml", "extri.yml"),
+    "openptv": ("*.ori", "*.addpar", "*.par"),
+}
 
 
 def read_any(path: Path) -> Rig:

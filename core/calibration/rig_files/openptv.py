@@ -58,13 +58,14 @@ def _parameters(path: Path) -> tuple[tuple[int, int], tuple[float, float]]:
         rest = 1 + 2 * int(lines[0]) + 3
         width, height, px, py = (float(v) for v in lines[rest : rest + 4])
         indices = [float(v) for v in lines[rest + 5 : rest + 8]]
-    except (ValueError, IndexError) as error:
+        size_px = int(width), int(height)
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} is damaged: it needs the image's size, the pixel's size and the media of all cameras.") from error
     if len(indices) == 3 and max(indices) > 1.001:
         raise InputError(
             f"The cameras of {path} look through glass or into water (refractive index {max(indices)}); only air is supported."
         )
-    return (int(width), int(height)), (px, py)
+    return size_px, (px, py)
 
 
 def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) -> Camera:
@@ -80,6 +81,8 @@ def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) ->
         raise InputError(f"The camera constant in {file} is {c:g} mm; the file is damaged.")
     start = np.array([f, cx, cy, k1 * c**2, k2 * c**4, k3 * c**6, -p2 * c, p1 * c, scx * pixel_mm[1] / pixel_mm[0] - 1, 0.0])
     name = file.name.split(".")[0]
+    if scx <= 0:
+        raise InputError(f"The scale of x in {extra} is {scx:g}; the file is damaged.")
     rays = _rays(parameters, size, pixel_mm)
     ours = camera_of(name, size, start, np.eye(3), np.zeros(3))
     try:

@@ -13,6 +13,8 @@ import numpy as np
 from .rig import Rig
 from .roles import marks_an_end, sided
 
+MOST_LIMBS = 100  # of one bone
+
 # By the rig's height
 SHORTEST_LIMB = 0.1  # shorter branches are no limbs
 LOW_END = 0.2  # the legs end below this height
@@ -86,6 +88,7 @@ def _pairs(rig: Rig) -> list[tuple[_Branch, _Branch]]:
     pairs = []
     for fork, children in enumerate(rig.children):
         branches = [b for b in (_branch(rig, child) for child in children) if b.length_m > SHORTEST_LIMB * rig.height_m]
+        branches = branches if len(branches) <= MOST_LIMBS else []  # no body forks so: every two would be compared
         for i, a in enumerate(branches):
             for b in branches[i + 1 :]:
                 if _mirrored(rig, fork, a, b):

@@ -99,6 +99,43 @@ def test_a_rig_is_not_written_over_in_another_format(take: Path, capfd: Capture)
     assert main.main(["calibrate", "--import", str(take / "other.toml"), "--out", str(take / "new.toml"), "--quiet"]) == 0
 
 
+@pytest.mark.parametrize("kind, read", [("colmap", "cameras.txt"), ("easymocap", "intri.yml"), ("openptv", "L.ori")])
+def test_no_calibration_is_written_over_that_lies_beside_the_one_that_is_read(take: Path, capfd: Capture, kind: str, read: str) -> None:
+    folder = take / "theirs"
+    write_as(folder, read_rig(take / "rig.toml"), kind)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    said = refused(["calibrate", "--import", str(folder / read), "--export", kind, "--out", str(folder)], capfd)
+    assert "is also an input" in said and {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_word_of_an_option_is_no_file(take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a folder has the same name: the second time, it is the one that the first time made."""
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert main.main(["calibrate", "--import", str(take / "rig.toml"), "--export", "colmap", "--out", "colmap", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize(
+    "command, name", [(["track", "--points"], "points2d.csv"), (["contour", "--view", "C", "--polygon"], "contours/C.csv")]
+)
+def test_results_that_are_read_are_not_replaced(take: Path, tmp_path: Path, capfd: Capture, command: list[str], name: str) -> None:
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    path.write_text("point,view,x,y\na,L,60,60\na,C,60,60\n")
+    before = path.read_bytes()
+    said = refused([command[0], str(take), *command[1:], str(path), "--out", str(tmp_path / "out")], capfd)
+    assert "is a result, which this command replaces" in said and path.read_bytes() == before
+
+
+def test_pictures_replace_no_result(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    for name in ("skin/texture.png", "report/cloud_0000.png"):
+        with pytest.raises(InputError, match="is also an input"):
+            check_output(tmp_path / name, [tmp_path])
+    check_output(tmp_path / "preview.png", [tmp_path])
+    check_output(tmp_path / "body.blend", [tmp_path])
+
+
 def test_2d_tracks_replace_neither_their_points_nor_the_images(take: Path, capfd: Capture) -> None:
     (take / "points.csv").write_text("point,x,y\na,60,60\n")
     before = names(take)
