@@ -19,19 +19,21 @@ REACH_M = 0.55  # m, a body's extent in depth beyond clicked joints
 NEAREST_M = 0.05  # m, smallest depth of all
 SPEED_M_S = 2.0  # m/s in depth, of a walking person
 MARGIN_M = 0.30  # m that a person may move in depth between frames, and by which a limb may exceed the cloud of the frame before
+FURTHEST_LIMB_M = 1.2  # m in front of the middle of a person's depths
 CLOUD_PERCENT = (1, 99)  # percentiles of a cloud's depths that are taken as its limits
 MIN_CLOUD = 20  # points of a cloud; fewer do not change the depths
 CLUSTER_WIDTH = 0.12  # of log depth
 CLUSTER_SHARE = 0.3  # of the seeds in the richest cluster
 PLANE_TOLERANCE_M = 0.015  # m
 PLANE_SIGMAS = 3.0  # of a point's own sigma across a plane, up to the tolerance once more
+NEAR_PLANE_M = 0.10  # m from a plane: seeds so near to it do not show where the person is
 PLANE_SHARE = 0.3  # of the static seeds that are left, which a plane must contain
 PLANE_MIN = 20  # seeds of a plane
 PLANE_EXTENT_M = 1.2  # m; longer than the flat front of a person who stands still
 EXTENT_PERCENT = (5, 95)  # percentiles along the longest axis that are taken as a plane's extent
 BEHIND_SHARE = 0.03  # of all seeds, which may lie behind a plane
-BEHIND_TOLERANCES = 4  # PLANE_TOLERANCE_M behind the plane, from which a seed lies behind it
-REMOVED_TOLERANCES = 2  # PLANE_TOLERANCE_M before the plane, up to which seeds belong to it and do not support another one
+BEHIND_TOLERANCES = 4  # tolerances behind the plane, from which a seed lies behind it
+REMOVED_TOLERANCES = 2  # tolerances before the plane, up to which seeds belong to it and do not support another one
 PLANE_TRIALS = 400  # triples of seeds
 MAX_PLANES = 3
 RANDOM_SEED = 1999
@@ -80,6 +82,10 @@ class Foreground:
             tolerance = PLANE_TOLERANCE_M + np.minimum(PLANE_SIGMAS * sigma, PLANE_TOLERANCE_M)
             return np.asarray(outside | (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1))
 
+    def off_planes(self, xyz_m: np.ndarray) -> np.ndarray:
+        """The points (N, 3) that are not so near to a plane that they may lie on it, as inaccurate as seeds are."""
+        return xyz_m[(xyz_m @ self.planes[:, :3].T - self.planes[:, 3] > NEAR_PLANE_M).all(axis=1)]
+
 
 def around_clicks(depth_m: np.ndarray) -> Foreground:
     """The depths of a body some of whose joints or surface points were clicked."""
@@ -103,7 +109,7 @@ def since_clicks(depth_m: np.ndarray, seconds: float, person_m: np.ndarray) -> F
 def nearest_surface(depth_m: np.ndarray) -> Foreground:
     """The nearest cluster of seeds' depths with at least CLUSTER_SHARE of the richest cluster's seeds."""
     position = np.log(np.sort(depth_m))
-    density = (np.abs(position[:, None] - position[None, :]) < CLUSTER_WIDTH).sum(axis=1)
+    density = _neighbours(position)
     nearest = position[np.argmax(density >= CLUSTER_SHARE * density.max())]
     members = depth_m[(np.log(depth_m) > nearest - CLUSTER_WIDTH) & (np.log(depth_m) < nearest + 2 * CLUSTER_WIDTH)]
     return Foreground(
@@ -115,32 +121,43 @@ def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD) -> F
     """The depths in the next frame, from those of the person in this one; fewer than `fewest` points change nothing."""
     if len(depth_m) < fewest:
         return before
-    low, high = np.percentile(depth_m, CLOUD_PERCENT)
+    low, high = (float(depth) for depth in np.percentile(depth_m, CLOUD_PERCENT))
+    position = np.log(np.maximum(depth_m, NEAREST_M))
+    middle = float(depth_m[np.argmax(_neighbours(position))])  # of the person; false seeds, common with two views, lie anywhere before it
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
-    near = max(NEAREST_M, float(low) - MARGIN_M)
-    return Foreground(depth_range_m=(near, min(float(high) + MARGIN_M, near + width)), method="frame before", planes=before.planes)
+    near = max(NEAREST_M, low - MARGIN_M, middle - FURTHEST_LIMB_M)
+    far = min(high + MARGIN_M, max(near + width, middle + 2 * MARGIN_M))
+    return Foreground(depth_range_m=(near, far), method="frame before", planes=before.planes)
 
 
-def background_planes(static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m: Sequence[np.ndarray]) -> np.ndarray:
+def _neighbours(position: np.ndarray) -> np.ndarray:
+    """(N,) of how many log depths (N,) each one's cluster consists."""
+    ordered = np.sort(position)
+    return np.searchsorted(ordered, position + CLUSTER_WIDTH) - np.searchsorted(ordered, position - CLUSTER_WIDTH)
+
+
+def background_planes(
+    static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m: Sequence[np.ndarray], tolerance_m: float = PLANE_TOLERANCE_M
+) -> np.ndarray:
     """Planes (P, 4) of floor and walls among seeds (N, 3) that do not change over time.
 
-    A plane must contain PLANE_SHARE of the static seeds that are left, be longer than a body's flat parts, and have hardly any of all
-    seeds behind it. The trials are seeded.
+    A plane must contain PLANE_SHARE of the static seeds that are left, within a tolerance, be longer than a body's flat parts, and have
+    hardly any of all seeds behind it. The trials are seeded.
     """
     planes: list[np.ndarray] = []
     rest = static_xyz_m
     random = np.random.default_rng(RANDOM_SEED)
     eye = np.mean(np.stack(list(cameras_m)), axis=0)
     while len(rest) >= PLANE_MIN and len(planes) < MAX_PLANES:
-        plane = _best_plane(rest, eye, random)
+        plane = _best_plane(rest, eye, random, tolerance_m)
         distance = rest @ plane[:3] - plane[3]
-        inlier = np.abs(distance) < PLANE_TOLERANCE_M
-        behind = float(np.mean(all_xyz_m @ plane[:3] - plane[3] < -BEHIND_TOLERANCES * PLANE_TOLERANCE_M))
+        inlier = np.abs(distance) < tolerance_m
+        behind = float(np.mean(all_xyz_m @ plane[:3] - plane[3] < -BEHIND_TOLERANCES * tolerance_m))
         if inlier.sum() < max(PLANE_MIN, PLANE_SHARE * len(rest)) or behind > BEHIND_SHARE or _extent(rest[inlier]) < PLANE_EXTENT_M:
             break
         planes.append(plane)
-        all_xyz_m = all_xyz_m[all_xyz_m @ plane[:3] - plane[3] > -BEHIND_TOLERANCES * PLANE_TOLERANCE_M]
-        rest = rest[distance > REMOVED_TOLERANCES * PLANE_TOLERANCE_M]
+        all_xyz_m = all_xyz_m[all_xyz_m @ plane[:3] - plane[3] > -BEHIND_TOLERANCES * tolerance_m]
+        rest = rest[distance > REMOVED_TOLERANCES * tolerance_m]
     return np.array(planes).reshape(-1, 4)
 
 
@@ -150,7 +167,7 @@ def _extent(points: np.ndarray) -> float:
     return float(np.diff(np.percentile(along, EXTENT_PERCENT))[0])
 
 
-def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator, tolerance_m: float) -> np.ndarray:
     """The plane through three points that contains most points, refitted to them."""
     triples = points[random.integers(0, len(points), (PLANE_TRIALS, 3))]
     normal = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -159,7 +176,7 @@ def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator
     if not len(normal):
         return np.array([0.0, 0.0, 1.0, -np.inf])
     distance = np.abs(points @ normal.T - np.einsum("ni,ni->n", normal, triples[:, 0]))
-    inlier = distance[:, (distance < PLANE_TOLERANCE_M).sum(axis=0).argmax()] < PLANE_TOLERANCE_M
+    inlier = distance[:, (distance < tolerance_m).sum(axis=0).argmax()] < tolerance_m
     centre = points[inlier].mean(axis=0)
     n = np.linalg.svd(points[inlier] - centre)[2][2]
     n = n if n @ (eye - centre) > 0 else -n

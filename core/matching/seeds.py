@@ -164,9 +164,24 @@ def _textured(views: Views, settings: MatchingSettings, xy: np.ndarray) -> np.nd
     return xy[patch.std(axis=1) > max(MIN_CONTRAST, CONTRAST_OVER_NOISE * image.noise)]
 
 
-def _default_range(views: Views) -> tuple[float, float]:
+def at_an_end(views: Views, depth_m: np.ndarray, depth_range_m: tuple[float, float]) -> np.ndarray:
+    """(M,) which seeds in depths (M,) were found at an end of the range in which they were searched for: that is no peak, they lie beyond.
+
+    They may grow to the surface all the same, but do not show where it is.
+    """
+    inverse = _inverse_depths(views, *depth_range_m)
+    step = inverse[1] - inverse[0]
+    return np.asarray((depth_m <= 1 / (inverse[-1] - step)) | (depth_m >= 1 / (inverse[0] + step)))
+
+
+def longest_base_m(views: Views) -> float:
+    """The largest distance between two of the cameras that are matched."""
     centres = np.stack([views.cameras[k].centre_m for k in (views.reference, *views.search)])
-    base = max(float(np.linalg.norm(a - b)) for a in centres for b in centres)
+    return max(float(np.linalg.norm(a - b)) for a in centres for b in centres)
+
+
+def _default_range(views: Views) -> tuple[float, float]:
+    base = longest_base_m(views)
     if base == 0:
         raise InputError("The cameras are at the same position; depth needs a distance between them. Calibrate again.")
     return NEAREST_BASES * base, FARTHEST_BASES * base

@@ -23,7 +23,7 @@ from ..images.sequence import IMAGE_ENDINGS
 from ..matching import foreground as fg
 from ..matching.least_squares import MatchingSettings
 from ..matching.region_growing import GrowingSettings, MatchedField
-from ..matching.seeds import Approximations, sweep_seeds
+from ..matching.seeds import Approximations, at_an_end, longest_base_m, sweep_seeds
 from ..matching.views import TemplateGrid, Views, template_grid
 from ..results.folder import Results
 from ..take.clicked_points import clicked_depth, clicked_seeds, seeds_before_joints, settled_seeds
@@ -31,7 +31,8 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import SurfaceSettings
 
-ALGORITHM = "surface 23"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 24"  # part of every key: raise it when the same input gives other numbers
+SEED_PX = 0.3  # precision of a seed in the images
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
 SEED_SPEED_M_S = 1.0  # sigma of the speed in depth at which seeds come from the frame before
@@ -121,8 +122,8 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
     if before is None:
         where, seeds = _first_foreground(now, settings, monitor)
     else:
-        depth, fewest = now.views.base.to_camera(before.person_m)[:, 2], MIN_SEEDS if before.field is None else fg.MIN_CLOUD
-        where = fg.after(depth, before.where, fewest)
+        person_m, fewest = before.where.off_planes(before.person_m), MIN_SEEDS if before.field is None else fg.MIN_CLOUD
+        where = fg.after(now.views.base.to_camera(person_m)[:, 2], before.where, fewest)
         if before.field is None:
             seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))
         else:
@@ -138,6 +139,8 @@ def _person_points(now: "FrameViews", settings: "MeasureSettings", seeds: Approx
     ref, reach = now.views.reference, SUPPORT_SPACINGS * (settings.growing.seed_spacing_px or SEED_SPACING_PX)
     xyz = _seed_points(now, seeds)
     outside = replace(where, silhouettes=now.silhouettes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+    if settings.growing.seed_spacing_px and where.depth_range_m != ANY_DEPTH_M:
+        outside |= at_an_end(now.views, seeds.depth_m, where.depth_range_m)
     xyz, depth, at = xyz[~outside], seeds.depth_m[~outside], seeds.xy[~outside, ref] * (1.0, now.views.rows.step)
     near = (np.abs(at[:, None] - at).max(axis=2) <= reach) & (np.abs(depth[:, None] - depth) <= SUPPORT_M)
     return np.asarray(xyz[near.sum(axis=1) > SUPPORT])
@@ -358,10 +361,16 @@ def _background_and_person(now: FrameViews, seeds: Approximations) -> tuple[np.n
     later = load_images(now.footage, other).grey[ref]
     xyz = _seed_points(now, seeds)
     still = fg.unchanged(now.grey[ref], later, seeds.xy[:, ref])
-    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in now.views.cameras])
+    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in now.views.cameras], _depth_tolerance_m(now, seeds.depth_m[still]))
     off_planes = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
     moved = off_planes & ~still
     return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else off_planes]
+
+
+def _depth_tolerance_m(now: FrameViews, depth_m: np.ndarray) -> float:
+    """How much seeds in these depths (N,) may be beside a plane on which they lie: cameras near each other see depth less precisely."""
+    base_px = now.views.base.focal_px * longest_base_m(now.views)
+    return max(fg.PLANE_TOLERANCE_M, SEED_PX * float(np.median(depth_m)) ** 2 / base_px if len(depth_m) else 0.0)
 
 
 def image_digests(footage: Footage, frame: int) -> list[str]:

@@ -232,7 +232,7 @@ def take_of_text(text: str, path: Path) -> Take:
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     check_keys(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
-        present = f"it has {shown(table.get('format'))} and {shown(table.get('version'))}"
+        present = f"it has {shown(table['format'])} and {shown(table['version'])}" if {"format", "version"} <= {*table} else "it lacks them"
         raise InputError(f'{where} must have format = "{FORMAT}" and version = {VERSION}; {present}.')
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)

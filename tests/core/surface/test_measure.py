@@ -145,7 +145,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
 def test_a_checkpoint_belongs_to_the_frame_that_showed_the_room(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames 0:2 first and then all of them, into one folder, must give what all of them give at once. The background planes differ
     with the frame that frame 0 is compared with; here the number of seeds that stand still is written into a plane far away."""
-    monkeypatch.setattr(starts.fg, "background_planes", lambda static, every, eyes: np.array([[0, 0, -1.0, -20.0 - len(static)]]))
+    monkeypatch.setattr(starts.fg, "background_planes", lambda static, *_: np.array([[0, 0, -1.0, -20.0 - len(static)]]))
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), moving_body_before_a_wall(scenes, 4))
     text = (take / "take.toml").read_text()
     (take / "take.toml").write_text(text.replace("[[views]]", "frames = [0, 2]\n[[views]]", 1))

@@ -1,0 +1,37 @@
+"""Where the person is in the next frame, from seeds of which some are false."""
+
+import numpy as np
+
+from tricap.core.matching.foreground import MARGIN_M, Foreground, after
+
+RANDOM = np.random.default_rng(5)
+PERSON_M = 3.8 + RANDOM.normal(0.0, 0.12, 90)
+
+
+def followed(false_m: np.ndarray, frames: int = 12) -> Foreground:
+    """The depths after some frames, in each of which there are seeds of the person, and false ones wherever seeds are searched for."""
+    where = Foreground(depth_range_m=(3.2, 4.4), method="nearest surface")
+    for _ in range(frames):
+        near, far = where.depth_range_m
+        seeds = np.concatenate([PERSON_M, near + false_m * (far - near)])
+        where = after(seeds[(seeds > near) & (seeds < far)], where)
+    return where
+
+
+def test_false_seeds_before_the_person_do_not_draw_the_depths_away() -> None:
+    for false_m in (np.zeros(0), RANDOM.uniform(0, 1, 60), RANDOM.uniform(0, 0.5, 60)):  # with two views, false ones are as many
+        near, far = followed(false_m).depth_range_m
+        assert near < PERSON_M.min() and far > PERSON_M.max() and far - near < 2.5
+
+
+def test_a_limb_before_the_person_is_within_the_depths() -> None:
+    arm = np.linspace(2.9, 3.6, 12)
+    near, far = after(np.concatenate([PERSON_M, arm]), Foreground(depth_range_m=(3.0, 4.4), method="nearest surface")).depth_range_m
+    assert near < 2.9 - 0.7 * MARGIN_M and far > PERSON_M.max()
+
+
+def test_seeds_near_a_wall_do_not_show_where_the_person_is() -> None:
+    wall = Foreground(depth_range_m=(3.2, 4.4), method="nearest surface", planes=np.array([[0.0, -1.0, 0.0, -1.18]]))
+    xyz = np.array([[0.0, y, 1.0] for y in (-0.2, 0.0, 0.3, 1.05, 1.12, 1.18, 1.2)])
+    assert wall.off_planes(xyz)[:, 1].tolist() == [-0.2, 0.0, 0.3, 1.05]
+    assert len(Foreground(depth_range_m=(3.2, 4.4), method="everything").off_planes(xyz)) == len(xyz)
