@@ -3,12 +3,14 @@
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
+from ...core.cli.streams import unheard
 from ...core.foundation import bounded
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
@@ -41,10 +43,56 @@ def open_rig(path: Path) -> None:
     if kind not in RIG_FILES:
         raise InputError(f"{path.name} is not a rig in a known format; choose one of {', '.join(RIG_FILES)}.")
     if kind == ".blend":
-        _try(lambda: bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False), path)
+        with _tamed() as devices:
+            _try(lambda: bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False), path)
+        if devices:
+            raise InputError(f"{path} names {devices[0]}, which is a device, a pipe or a socket, not a file; remove it from the file.")
         return
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     import_rig(path)
+
+
+@contextmanager
+def _tamed() -> Iterator[list[str]]:
+    """Files that are opened meanwhile write no caches and read from no devices or pipes, of which the names are given; then nothing is left
+    of the file. Fluids, which write wherever a file says, are switched off before they are evaluated; other simulations stay in memory."""
+    devices = list[str]()
+
+    @bpy.app.handlers.persistent
+    def switch_off(*_: object) -> None:
+        devices[:] = [name for name in bpy.utils.blend_paths(absolute=True) if _is_device(Path(name))]
+        if devices:
+            bpy.data.batch_remove(bpy.data.objects)
+        for modifier in (m for o in bpy.data.objects for m in o.modifiers):
+            if modifier.type == "FLUID":
+                modifier.show_viewport = modifier.show_render = False
+        for cache in _point_caches():
+            cache.use_disk_cache = cache.use_external = False
+
+    bpy.app.handlers.load_post.append(switch_off)
+    try:
+        yield devices
+    finally:
+        if switch_off in bpy.app.handlers.load_post:
+            bpy.app.handlers.load_post.remove(switch_off)
+
+
+def _is_device(path: Path) -> bool:
+    try:
+        return path.exists() and not (path.is_file() or path.is_dir())
+    except (OSError, ValueError):  # no name of a file
+        return False
+
+
+def _point_caches() -> Iterator[bpy.types.PointCache]:
+    for thing in bpy.data.objects:
+        yield from (system.point_cache for system in thing.particle_systems)
+        for modifier in thing.modifiers:
+            if modifier.type in ("CLOTH", "SOFT_BODY"):
+                yield modifier.point_cache
+            elif modifier.type == "DYNAMIC_PAINT" and modifier.canvas_settings:
+                yield from (surface.point_cache for surface in modifier.canvas_settings.canvas_surfaces)
+    yield from (scene.rigidbody_world.point_cache for scene in bpy.data.scenes if scene.rigidbody_world)
 
 
 def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -> Motion:
@@ -123,7 +171,8 @@ def _try(load: Callable[[], object], path: Path) -> None:
     """Run an importer; any error that it raises becomes an InputError about the file."""
     try:
         bounded.check_file(path, bounded.ARRAYS_BYTES)
-        load()
+        with unheard() if bpy.app.background else nullcontext():  # importers print tracebacks of their own
+            load()
     except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text
         raise InputError(f"Blender cannot read {path} ({_reason(error)}); it is damaged or in another format; export it again.") from error
 

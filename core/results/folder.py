@@ -15,6 +15,7 @@ import numpy as np
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.lock import NAME, locked
+from ..images.sequence import IMAGE_ENDINGS
 from . import run_json
 from .run_json import FORMAT, VERSION
 
@@ -50,14 +51,16 @@ def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable
     """Refuse to mix results with footage, because one could replace the other.
 
     Raises:
-        InputError: OUT is a take or contains its footage, or the take lies where results are replaced.
+        InputError: OUT is a take, contains its footage or lies among its images, or the take lies where results are replaced.
     """
     where = bounded.real_path(out)
     advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
     if (where / "take.toml").exists():
         raise InputError(f"{out} is itself a take; {advice}")
     for path in footage:
-        if where in (bounded.real_path(path.parent), bounded.real_path(path).parent):
+        folders = {bounded.real_path(path.parent), bounded.real_path(path).parent}
+        among = path.suffix.lower() in IMAGE_ENDINGS and take is not None and bounded.real_path(take) not in folders
+        if where in folders or (among and folders.intersection(where.parents)):
             raise InputError(f"{out} contains the footage {path.name}; {advice}")
     if take is not None and any(bounded.real_path(take).is_relative_to(where / name) for name in WRITTEN):
         raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")

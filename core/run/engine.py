@@ -4,7 +4,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,21 +54,26 @@ def dask_client(engine: Engine) -> Iterator[Any]:
             yield client
         return
     quiet = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": engine.retries}
-    with (
-        dask.config.set(quiet),
-        LocalCluster(
-            n_workers=engine.workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # of its HTTP server: by default one port, which another batch may have
-            memory_limit=0,
-            silence_logs=50,
-            env=thread_limits(engine.workers, os.cpu_count() or 1),
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with dask.config.set(quiet), ExitStack() as running:
+        try:
+            cluster = running.enter_context(
+                LocalCluster(
+                    n_workers=engine.workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address=None,
+                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # by default one port, which another batch may have
+                    memory_limit=0,
+                    silence_logs=50,
+                    env=thread_limits(engine.workers, os.cpu_count() or 1),
+                )
+            )
+            client = running.enter_context(Client(cluster))
+        except (OSError, RuntimeError) as error:
+            raise InputError(
+                f"The worker processes cannot be started ({error}); raise the system's limits of files and processes, or use --workers 1."
+            ) from error
         yield client
 
 

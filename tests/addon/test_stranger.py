@@ -14,7 +14,11 @@ import pytest
 
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
+from tricap.addon.retarget.files import open_rig
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.store import write_bytes
 from tricap.core.motion.formats.bvh import write_bvh
+from tricap.core.report.pictures import png
 
 from ..core.motion.persons import person, squat
 from .conftest import SmallRun
@@ -117,6 +121,48 @@ def test_scripts_in_the_file_of_a_rig_do_not_run(blender: ModuleType, empty: Mod
     assert main(argv) == 0 and not ran.exists()
     empty.ops.wm.open_mainfile(filepath=str(tmp_path / "hero.blend"), load_ui=False, use_scripts=True)
     assert ran.exists(), "they would run where they are let"
+
+
+def with_a_rig(bpy: ModuleType, folder: Path) -> Path:
+    """A .blend with a moving person, and a cube."""
+    build_armature(squat(person()), "Rig")
+    mesh = bpy.data.meshes.new("cube")
+    corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    mesh.from_pydata(corners, [], [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("cube", mesh))
+    return folder / "rig.blend"
+
+
+def test_simulations_in_the_file_of_a_rig_write_nothing(empty: ModuleType, tmp_path: Path) -> None:
+    path, outside = with_a_rig(empty, tmp_path), tmp_path / "outside"
+    cube = empty.data.objects["cube"]
+    cloth = cube.modifiers.new("cloth", "CLOTH")
+    cloth.point_cache.use_disk_cache = True
+    fluid = cube.modifiers.new("fluid", "FLUID")
+    fluid.show_viewport = False  # in this process Blender would write, too
+    fluid.fluid_type = "DOMAIN"
+    fluid.domain_settings.cache_directory = str(outside)
+    empty.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    open_rig(path)
+    opened = empty.data.objects["cube"].modifiers
+    assert not opened["cloth"].point_cache.use_disk_cache and not opened["fluid"].show_viewport and not opened["fluid"].show_render
+    for frame in (1, 2, 3):
+        empty.context.scene.frame_set(frame)
+    assert not outside.exists() and not (tmp_path / "blendcache_rig").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_rig_that_names_a_pipe_is_refused(empty: ModuleType, tmp_path: Path) -> None:
+    path, picture = with_a_rig(empty, tmp_path), tmp_path / "skin.png"
+    write_bytes(picture, png(np.zeros((4, 4), dtype=np.uint8)))
+    empty.data.images.load(str(picture)).use_fake_user = True
+    empty.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    open_rig(path)
+    picture.unlink()
+    os.mkfifo(picture)
+    with pytest.raises(InputError, match="skin.png, which is a device, a pipe or a socket"):
+        open_rig(path)
+    assert not empty.data.objects
 
 
 def test_two_keys_in_a_million_frames_are_refused(empty: ModuleType) -> None:

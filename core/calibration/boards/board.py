@@ -18,6 +18,7 @@ from ...foundation.settings import nearest_name
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and name == name.upper()))
 MARKER_PART = 0.75  # of a square's side, where the size of the markers is not given
 MOST_SQUARES = 60  # along a side
+SMALLEST_M = 1e-5  # of a square or a marker, under a microscope
 LARGEST_SQUARE_M = 5.0
 PRINT_DPI = 300
 POINTS_PER_M = 72 / 0.0254  # of PDF
@@ -60,7 +61,7 @@ class Board:
             raise InputError(
                 f"The board has {self.label}; give the number of {counted} across and down, {least} to {MOST_SQUARES}, as in 9x6."
             )
-        if not (math.isfinite(self.square_m) and 0 < self.square_m < LARGEST_SQUARE_M):
+        if not (math.isfinite(self.square_m) and SMALLEST_M <= self.square_m < LARGEST_SQUARE_M):
             raise InputError(f"The board's squares are given as {self.square_m:g} m; measure the side of a square in metres, such as 0.03.")
         if self.kind is BoardKind.CHARUCO:
             self._check_markers()
@@ -69,7 +70,7 @@ class Board:
         if self.dictionary not in DICTIONARIES:
             hint = nearest_name(self.dictionary, list(DICTIONARIES))
             raise InputError(f"There is no dictionary “{self.dictionary}” of markers.{hint} Give the one that the board was made with.")
-        if not 0 <= self.marker_m < self.square_m:
+        if self.marker_m != 0 and not SMALLEST_M <= self.marker_m < self.square_m:
             raise InputError(f"The markers are given as {self.marker_m:g} m; they must be smaller than the squares, {self.square_m:g} m.")
         needed, there = self.squares[0] * self.squares[1] // 2, len(self.markers.bytesList)
         if needed > there:

@@ -17,6 +17,7 @@ from ...foundation.errors import InputError
 
 DEEPEST = 200  # nodes in each other
 MOST_NODES = 10_000  # and instances, each of which becomes an object, and shapes of meshes
+MOST_BONES = 3000  # of a skin: Blender's time grows with their square
 MOST_ANIMATED = 1_000_000  # nodes times animations: the importer looks for every node in every animation
 MOST_VALUES = 10_000_000  # of all accessors, as often as they are used
 VALUES_PER_BYTE = 20  # for larger files
@@ -67,11 +68,14 @@ def check_gltf(path: Path) -> None:
         nodes = table.get("nodes", [])
         _check_tree(nodes)
         count = len(nodes) + sum(_instances(table, node) for node in nodes) + _shapes(table)
+        bones = max((len(skin["joints"]) for skin in table.get("skins", [])), default=0)
         animated = len(nodes) * len(table.get("animations", []))
         values = sum(_values(table, accessor) for accessor in _used(table)) + _decompressed(table)
         most = max(MOST_VALUES, VALUES_PER_BYTE * path.stat().st_size)
     except DAMAGE as error:
         raise unreadable(path, error) from error
+    if bones > MOST_BONES:
+        raise InputError(f"{path} has {bones} bones, more than {MOST_BONES}; export the rig alone.")
     if count > MOST_NODES:
         raise InputError(f"{path} has {count} nodes and shapes, more than {MOST_NODES}; export the rig alone.")
     if animated > MOST_ANIMATED:

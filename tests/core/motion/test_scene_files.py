@@ -10,7 +10,7 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.fbx import MOST_OBJECTS, check_fbx
-from tricap.core.motion.formats.gltf import MOST_NODES, check_gltf
+from tricap.core.motion.formats.gltf import MOST_BONES, MOST_NODES, check_gltf
 
 from ...mutations import memory_mb
 from ...scene_files import model, number, record, text, write_fbx, write_gltf, zeros
@@ -108,6 +108,7 @@ MESHOPT = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 36, "byteStrid
         ({"accessors": [{**FLOATS, "count": 20_000_000}]}, "asks for 60000000 numbers, far more than it contains"),
         ({"accessors": [{**FLOATS, "count": 1000}], "meshes": REUSED}, "asks for 12000000 numbers"),
         ({"nodes": [{"name": "a"}] * (MOST_NODES + 1)}, "10001 nodes and shapes, more than 10000"),
+        ({"nodes": [{"name": "a"}], "skins": [{"joints": [0] * (MOST_BONES + 1)}]}, "3001 bones, more than 3000"),
         ({"nodes": [GPU], "accessors": [{**FLOATS, "count": 10**6}]}, "1000001 nodes"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 36, "extensions": MESHOPT}]}, "asks for 300000009 numbers"),
         ({"buffers": [{"byteLength": 36, "uri": "/dev/zero"}]}, "“/dev/zero”, which lies outside its folder"),

@@ -61,6 +61,7 @@ def test_results_go_into_no_footage_whatever_way_leads_there(take: Path, tmp_pat
         (tmp_path / link).symlink_to(to)
     before = names(tmp_path)
     for out, said in ((take / "L", "contains the footage 0000.png"), (take / "R", "the footage"), (tmp_path / "films of R", "the footage"),
+                      (take / "L" / "new" / "deep", "the footage"),
                       (tmp_path / "to take", "is itself a take"), (tmp_path / "to L", "contains the footage"),
                       (take / "L" / ".." / "C", "contains the footage")):  # fmt: skip
         assert said in refused(["run", str(take), "--out", str(out)], capfd)
@@ -89,6 +90,7 @@ def test_a_folder_of_results_in_the_take_is_fine(take: Path, tmp_path: Path) -> 
     assert (take / "results" / "clouds" / "0000.ply").exists()
     check_separate_folder(tmp_path, take)
     check_separate_folder(take.parent / "kick é_tricap", take, [take / "L" / "0000.png"])
+    check_separate_folder(take / "results", take, [take / "L.mp4", take / "0000.png"])
 
 
 def test_a_rig_is_not_written_over_in_another_format(take: Path, capfd: Capture) -> None:
