@@ -127,7 +127,7 @@ def read_json(path: Path) -> Any:
 def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:
     """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
     own = {"store_version": STORE_VERSION, "arrays": sorted(arrays), CONTENT: _content(arrays)}
-    text = json.dumps({**own, **header}, sort_keys=True, allow_nan=False)
+    text = json.dumps({**header, **own}, sort_keys=True, allow_nan=False)
     write = np.savez_compressed if compress else np.savez
     with written(path) as file:
         write(file, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ import numpy as np
 from ..body.motion import BodyFit, BodyMotion
 from ..body.shape import body_of, body_text
 from ..fitting.inputs.start_joints import StartJoints
+from ..foundation import bounded
 from ..results.folder import Results
 
 STAGE, NAME = "body", "fitted"
@@ -50,7 +51,7 @@ def read_fitted(results: Results, key: str) -> FittedBody | None:
     arrays = results.load_checkpoint(STAGE, NAME, key)
     if arrays is None:
         return None
-    values = json.loads(str(arrays["values_json"]))
+    values = bounded.json_of(str(arrays["values_json"]))
     shape = body_of(values["shape"])
     motion: dict[str, Any] = {f.name: arrays[f"motion_{f.name}"] for f in fields(BodyMotion) if f.name not in OF_SHAPE}
     motion |= dict(known=tuple(map(tuple, motion["known"].tolist())), status=tuple(motion["status"].tolist()))

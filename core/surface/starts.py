@@ -122,8 +122,8 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
     if before is None:
         where, seeds = _first_foreground(now, settings, monitor)
     else:
-        person_m, fewest = before.where.off_planes(before.person_m), MIN_SEEDS if before.field is None else fg.MIN_CLOUD
-        where = fg.after(now.views.base.to_camera(person_m)[:, 2], before.where, fewest)
+        depth, fewest = _sure_depths(now.views, before), MIN_SEEDS if before.field is None else fg.MIN_CLOUD
+        where = fg.after(depth, before.where, fewest)
         if before.field is None:
             seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))
         else:
@@ -134,13 +134,18 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
     return FrameStart(frame=now.frame, where=where, seeds=seeds, person_m=_person_points(now, settings, seeds, where), key=key)
 
 
+def _sure_depths(views: Views, before: FrameStart) -> np.ndarray:
+    """The depths (M,) of the person in the frame before, of seeds that are neither near a plane nor at an end of the range."""
+    depth = views.base.to_camera(before.where.off_planes(before.person_m))[:, 2]
+    searched = before.field is None and before.where.depth_range_m != ANY_DEPTH_M
+    return depth[~at_an_end(views, depth, before.where.depth_range_m)] if searched else depth
+
+
 def _person_points(now: "FrameViews", settings: "MeasureSettings", seeds: Approximations, where: fg.Foreground) -> np.ndarray:
     """The seeds (N, 3) that belong to the person: in the foreground, and next to others in the image and in depth."""
     ref, reach = now.views.reference, SUPPORT_SPACINGS * (settings.growing.seed_spacing_px or SEED_SPACING_PX)
     xyz = _seed_points(now, seeds)
     outside = replace(where, silhouettes=now.silhouettes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
-    if settings.growing.seed_spacing_px and where.depth_range_m != ANY_DEPTH_M:
-        outside |= at_an_end(now.views, seeds.depth_m, where.depth_range_m)
     xyz, depth, at = xyz[~outside], seeds.depth_m[~outside], seeds.xy[~outside, ref] * (1.0, now.views.rows.step)
     near = (np.abs(at[:, None] - at).max(axis=2) <= reach) & (np.abs(depth[:, None] - depth) <= SUPPORT_M)
     return np.asarray(xyz[near.sum(axis=1) > SUPPORT])

@@ -57,8 +57,11 @@ RIGS: dict[str, tuple[Rig, str]] = {
     "one camera": (Rig(cameras=CAMERAS[:1]), "one camera"),
     "focal length of another size": (with_first(matrix=scaled(CAMERAS[0].matrix, focal=0.1)), "odd camera"),
     "principal point of a crop": (with_first(matrix=scaled(CAMERAS[0].matrix, shift_px=300)), "odd camera"),
-    "distortion that folds": (with_first(distortions=np.array([-6.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
-    "fisheye that folds": (with_first(fisheye=True, distortions=np.array([-30.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
+    "distortion that folds": (with_first(distortions=np.array([-3.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
+    "distortion that folds the middle": (with_first(distortions=np.array([-0.5, -0.5, 2.5, 2.5, -0.5])), "input"),
+    "fisheye that folds": (with_first(fisheye=True, distortions=np.array([-4.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
+    "fisheye that folds the middle": (with_first(fisheye=True, distortions=np.array([-30.0, 0.0, 0.0, 0.0, 0.0])), "input"),
+    "no width": (with_first(affinity=np.array([-1.0, 0.0])), "input"),
     "poor by its own word": (Rig(cameras=CAMERAS, metadata={"verdict": "Poor: points within 20 mm."}), "poor calibration"),
     "red without a word for it": (
         Rig(cameras=CAMERAS, metadata={"verdict": "The adjustment did not converge.", "light": "red"}),

@@ -1,8 +1,14 @@
 """Where the person is in the next frame, from seeds of which some are false."""
 
+from typing import Any
+
 import numpy as np
 
+from tricap.core.images.interlace import row_grid
+from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.foreground import MARGIN_M, Foreground, after
+from tricap.core.matching.seeds import at_an_end
+from tricap.core.matching.views import Views
 
 RANDOM = np.random.default_rng(5)
 PERSON_M = 3.8 + RANDOM.normal(0.0, 0.12, 90)
@@ -22,6 +28,14 @@ def test_false_seeds_before_the_person_do_not_draw_the_depths_away() -> None:
     for false_m in (np.zeros(0), RANDOM.uniform(0, 1, 60), RANDOM.uniform(0, 0.5, 60)):  # with two views, false ones are as many
         near, far = followed(false_m).depth_range_m
         assert near < PERSON_M.min() and far > PERSON_M.max() and far - near < 2.5
+
+
+def test_seeds_at_an_end_of_the_range_are_no_peaks(scenes: Any) -> None:
+    rig = scenes.three_cameras()
+    images = [SplineImage(np.zeros((40, 60), np.float32)) for _ in rig.cameras]
+    views = Views(images=images, cameras=rig.cameras, reference=1, rows=row_grid("none"))
+    depth = np.array([2.0, 2.001, 2.5, 3.0, 3.99, 4.0])
+    assert at_an_end(views, depth, (2.0, 4.0)).tolist() == [True, True, False, False, True, True]
 
 
 def test_a_limb_before_the_person_is_within_the_depths() -> None:
