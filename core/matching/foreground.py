@@ -117,16 +117,21 @@ def nearest_surface(depth_m: np.ndarray) -> Foreground:
     )
 
 
-def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD) -> Foreground:
-    """The depths in the next frame, from those of the person in this one; fewer than `fewest` points change nothing."""
+def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, confirmed: bool = True) -> Foreground:
+    """The depths in the next frame, from those of the person in this one; fewer than `fewest` points change nothing.
+
+    Where matches are not `confirmed` by a third view, as many seeds may be false as true, everywhere before the person: then the depths
+    keep the richest cluster.
+    """
     if len(depth_m) < fewest:
         return before
     low, high = (float(depth) for depth in np.percentile(depth_m, CLOUD_PERCENT))
-    position = np.log(np.maximum(depth_m, NEAREST_M))
-    middle = float(depth_m[np.argmax(_neighbours(position))])  # of the person; false seeds, common with two views, lie anywhere before it
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
-    near = max(NEAREST_M, low - MARGIN_M, middle - FURTHEST_LIMB_M)
-    far = min(high + MARGIN_M, max(near + width, middle + 2 * MARGIN_M))
+    near, latest = max(NEAREST_M, low - MARGIN_M), -np.inf
+    if not confirmed:
+        middle = float(depth_m[np.argmax(_neighbours(np.log(np.maximum(depth_m, NEAREST_M))))])
+        near, latest = max(near, middle - FURTHEST_LIMB_M), middle + 2 * MARGIN_M
+    far = min(high + MARGIN_M, max(near + width, latest))
     return Foreground(depth_range_m=(near, far), method="frame before", planes=before.planes)
 
 

@@ -122,8 +122,9 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
     if before is None:
         where, seeds = _first_foreground(now, settings, monitor)
     else:
-        depth, fewest = _sure_depths(now.views, before), MIN_SEEDS if before.field is None else fg.MIN_CLOUD
-        where = fg.after(depth, before.where, fewest)
+        confirmed = now.views.required_matches(settings.growing.pairs) > 1
+        depth = now.views.base.to_camera(before.person_m)[:, 2] if confirmed else _sure_depths(now.views, before)
+        where = fg.after(depth, before.where, MIN_SEEDS if before.field is None else fg.MIN_CLOUD, confirmed=confirmed)
         if before.field is None:
             seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))
         else:

@@ -20,7 +20,7 @@ def followed(false_m: np.ndarray, frames: int = 12) -> Foreground:
     for _ in range(frames):
         near, far = where.depth_range_m
         seeds = np.concatenate([PERSON_M, near + false_m * (far - near)])
-        where = after(seeds[(seeds > near) & (seeds < far)], where)
+        where = after(seeds[(seeds > near) & (seeds < far)], where, confirmed=False)
     return where
 
 
@@ -40,8 +40,10 @@ def test_seeds_at_an_end_of_the_range_are_no_peaks(scenes: Any) -> None:
 
 def test_a_limb_before_the_person_is_within_the_depths() -> None:
     arm = np.linspace(2.9, 3.6, 12)
-    near, far = after(np.concatenate([PERSON_M, arm]), Foreground(depth_range_m=(3.0, 4.4), method="nearest surface")).depth_range_m
-    assert near < 2.9 - 0.7 * MARGIN_M and far > PERSON_M.max()
+    for confirmed in (True, False):
+        before = Foreground(depth_range_m=(2.8, 4.4), method="nearest surface")
+        near, far = after(np.concatenate([PERSON_M, arm]), before, confirmed=confirmed).depth_range_m
+        assert near < 2.9 - 0.7 * MARGIN_M and far > PERSON_M.max()
 
 
 def test_seeds_near_a_wall_do_not_show_where_the_person_is() -> None:
