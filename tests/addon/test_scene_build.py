@@ -195,6 +195,10 @@ def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, sma
         save_blend(tmp_path / name)
         assert (tmp_path / name).with_suffix(".blend1").read_text() == "clicks" and (tmp_path / name).stat().st_size > 1000
         (tmp_path / name).with_suffix(".blend1").unlink()
+    (tmp_path / "folder.blend").mkdir()
+    with pytest.raises(InputError, match="folder.blend is a folder"):
+        save_blend(tmp_path / "folder.blend")
+    assert (tmp_path / "folder.blend").is_dir()
     (tmp_path / "run.json").write_text("{}")
     save_blend(tmp_path / "body.blend")
     assert not list(tmp_path.glob("*.blend1"))

@@ -117,6 +117,12 @@ def test_views_out_of_step_are_found_and_reported() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("square_m, marker_m", [(1e-300, 0.0), (0.0, 0.0), (0.04, 1e-300), (0.04, 0.05)])
+def test_squares_and_markers_that_no_print_has(square_m: float, marker_m: float) -> None:
+    with pytest.raises(InputError, match="are given as"):
+        Board(kind=BoardKind.CHARUCO, squares=(7, 5), square_m=square_m, marker_m=marker_m)
+
+
 def test_cameras_that_are_not_in_step_are_calibrated_with_a_waved_board() -> None:
     """Measured over 6 recordings: delays within 0.0003 images, errors 1.0 to 1.6 times the bound of cameras in step."""
     rng, delay = np.random.default_rng(2), (0.0, 0.37, -2.2)

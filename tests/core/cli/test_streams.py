@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tricap.core.cli.main import _progress_line
+from tricap.core.cli.main import _progress_line, main
 from tricap.core.cli.streams import write_line
 from tricap.core.foundation.errors import InputError, sentence_of
 from tricap.core.foundation.progress import Monitor
@@ -76,6 +76,12 @@ def test_what_names_would_do_to_a_terminal_is_shown_instead(capfd: pytest.Captur
     shown = capfd.readouterr().out
     assert shown.startswith("a\\u001b]0;pwn\\u0007\\u009b31m\\u202eé\u200d\U0001f600\ttab\\u007f\nsecond\n{")
     assert json.loads(shown.splitlines()[-1]) == {"a": evil}
+
+
+def test_arguments_that_are_unknown_do_not_steer_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["check", "a", "b\x1b[31m\u202e"])
+    assert "unrecognized arguments: b\\u001b[31m\\u202e" in capfd.readouterr().err
 
 
 def test_a_progress_bar_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
+from tricap.core.motion.retarget import shape
 from tricap.core.motion.retarget.mapping import NEEDED, apply_preset, best_preset, by_names, find_map, fit_of, read_preset, write_map
 from tricap.core.motion.retarget.rig import Rig
 from tricap.core.motion.retarget.roles import ROLES, parent_role, part_of, read_name, side_of, sided
@@ -152,6 +153,19 @@ def test_nothing_like_a_body_is_said() -> None:
     assert by_shape(rig) is None
     with pytest.raises(InputError, match="recognised"):
         find_map(rig)
+
+
+def test_a_bone_with_hundreds_of_limbs_is_no_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every two of them are compared."""
+    compared = list[tuple[object, ...]]()
+    monkeypatch.setattr(shape, "_mirrored", lambda *pair: compared.append(pair) or False)
+    n = 300
+    tail_m = np.stack([np.cos(np.arange(n)), np.sin(np.arange(n)), np.full(n, 0.2)], axis=1)
+    star = Rig(
+        names=tuple(f"b{i}" for i in range(n)), parents=np.array([-1] + [0] * (n - 1)), R_rest=np.tile(np.eye(3), (n, 1, 1)),
+        head_m=np.zeros((n, 3)), tail_m=tail_m, connected=np.zeros(n, dtype=bool), inherits_rotation=np.ones(n, dtype=bool),
+    )  # fmt: skip
+    assert by_shape(star) is None and not compared
 
 
 def test_presets_read_write_and_fit_their_own(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run import take_run, workers
-from tricap.core.run.engine import Engine, python_command
+from tricap.core.run.engine import Engine, dask_client, python_command
 
 TWO = Engine(workers=2, retries=1)
 
@@ -32,6 +32,17 @@ def measured(take: Path, out: Path, engine: Engine, monitor: Monitor | None = No
     with take_run.open_run(take, out) as job:
         workers.measure_at_once(job, engine, monitor or Monitor(), set())
     return checkpoints(out)
+
+
+def test_workers_that_cannot_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed
+
+    def fails(**_: object) -> None:
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(distributed, "LocalCluster", fails)
+    with pytest.raises(InputError, match="worker processes cannot be started"), dask_client(TWO):
+        pass
 
 
 def test_workers_give_the_bytes_of_one_process(plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
