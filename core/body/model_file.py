@@ -38,6 +38,7 @@ class BodyModel:
     stations: np.ndarray  # (B, 3) fractions of the bone where its balls are
     aside: np.ndarray  # (B, 3, 2) their offsets from the bone in its x and z, as fractions of its length
     length_sigma: np.ndarray  # (B,) relative sigma of a bone's length that clicks on its joints leave
+    joint_places_m: Mapping[str, np.ndarray]  # (3,) where a joint usually lies from where surfaces alone put it, in its bone's axes
 
     def __post_init__(self) -> None:
         b = len(self.skeleton.bones)
@@ -46,6 +47,10 @@ class BodyModel:
         object.__setattr__(self, "stations", frozen(self.stations, (b, 3), name="stations"))
         object.__setattr__(self, "aside", frozen(self.aside, (b, 3, 2), name="aside"))
         object.__setattr__(self, "length_sigma", frozen(self.length_sigma, (b,), name="length_sigma"))
+        for joint in set(self.joint_places_m) - set(self.skeleton.joint_names):
+            raise ValueError(f"there is no joint “{joint}” to place.{nearest_name(joint, self.skeleton.joint_names)}")
+        places = {joint: frozen(place, (3,), name=f"place of {joint}") for joint, place in self.joint_places_m.items()}
+        object.__setattr__(self, "joint_places_m", places)
 
 
 def model_names() -> tuple[str, ...]:
@@ -150,6 +155,7 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
         stations=model.stations[rows],
         aside=model.aside[rows],
         length_sigma=model.length_sigma[rows],
+        joint_places_m={joint: place for joint, place in model.joint_places_m.items() if joint in skeleton.joint_names},
     )
 
 
@@ -188,6 +194,7 @@ def mirrored(model: BodyModel, name: str) -> BodyModel:
         stations=model.stations,
         aside=model.aside * MIRROR[[0, 2]],
         length_sigma=model.length_sigma,
+        joint_places_m={other_side(joint): place * MIRROR for joint, place in model.joint_places_m.items()},
     )
 
 
@@ -256,10 +263,12 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
         surface, stations = [t.get("surface", (0.0, 1.0)) for t in rows], [t.get("stations", STATIONS) for t in rows]
         aside = [np.array(t.get("aside", np.zeros((3, 2))), dtype=float) for t in rows]
         open_lengths = [float(t.get("length_sigma", 0.0)) for t in rows]
+        places = {str(joint): np.array(place, dtype=float) for joint, place in table.get("joint_places_m", {}).items()}
         if table.get("symmetric", False):
             right = [i for i, bone in enumerate(bones) if bone.name.endswith(".R")]
             bones += [_mirrored_bone(bones[i]) for i in right]
             aside += [aside[i] * MIRROR[[0, 2]] for i in right]
+            places |= {other_side(joint): place * MIRROR for joint, place in places.items() if joint.endswith(".R")}
             columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths)
             radii, surface, stations, open_lengths = ([*column, *(column[i] for i in right)] for column in columns)
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
@@ -271,6 +280,7 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             stations=np.array(stations),
             aside=np.array(aside),
             length_sigma=np.array(open_lengths),
+            joint_places_m=places,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks an entry or has a wrong value: {error}.") from error

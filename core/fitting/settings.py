@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 18"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 19"  # part of the fit's key: raise it when the same input gives another body
 START_ALONE = ("auto", "full", "upper_body")  # models whose joints need no clicks; a limb starts alone where its person is visible
 
 
@@ -86,8 +86,8 @@ class FitSettings:
     )
     place_joints: str = knob(
         "auto",
-        "Joints lie in the body where they were clicked, in any frame: on, off, or auto (of bodies with a left and a right side, whose "
-        "clicks confirm each other).",
+        "Joints lie in the body where they usually lie, and where they were clicked, in any frame: on, off, or auto (of bodies with a left "
+        "and a right side, whose clicks confirm each other).",
         choices=("auto", "on", "off"),
     )
     length_sigma: float = knob(

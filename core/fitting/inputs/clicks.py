@@ -76,6 +76,8 @@ def _check_agreement(name: str, cameras: Sequence[Camera], xy_px: np.ndarray, po
         return
     miss = np.nan_to_num(np.linalg.norm(point.residual_px[0], axis=1), nan=np.inf)
     worst = doubtful_view(cameras, xy_px) if len(cameras) > 2 else int(np.argmax(miss))
+    if not np.isfinite(miss).any():
+        raise InputError(f"The rays of the clicks on “{name}” do not meet; click it again, and check where the cameras stand in rig.toml.")
     raise InputError(
         f"The clicks on “{name}” contradict each other by up to {miss.max():.0f} px; "
         f"check view {cameras[worst].name} first and click the joint again."

@@ -1,17 +1,18 @@
-"""The places of the joints in the body, as they were clicked.
+"""The places of the joints in the body: where they usually lie, and as they were clicked.
 
 Where in the flesh a joint lies, a surface does not show, and a click elsewhere in one frame cannot outweigh the points of all frames. But a
 joint has the same place in its bone in all of them. After the adjustment each joint gets a shift d in the axes of the bone that ends there,
-from the clicks of any frame, and from its motion, for bones turn about their joints:
+from where it usually lies (m, of the body model), the clicks of any frame, and its motion, for bones turn about their joints:
 
     click_k = projection_k(X + R d + e) + ε ,   ε ~ N(0, σ) ,   e ~ N(0, POSE_SIGMA_M) common to the views of one frame           (1)
-    d = c + o ,   c ~ N(0, COMMON r) the same on the left and on the right (mirrored) ,   o ~ N(0, OWN r)                         (2)
+    d = m + c + o ,   c ~ N(0, COMMON r) the same on the left and on the right (mirrored) ,   o ~ N(0, OWN r)                         (2)
     X(θ_t + p_t, L) − X(θ_t) − R d ~ N(0, MOTION_SIGMA_M) ,   p_t ~ N(0, TURN_SIGMA)                                              (3)
 
-r is the thickness of the flesh at the joint. σ is estimated from how well the rays of the clicks meet, with the knob `click_sigma_px` as
-`PRIOR_FREEDOM` further observations. Unknown are d, the bone lengths L with their priors, and p_t, which are eliminated frame by frame. In
-(3) the frames within `CORRELATION_S` count as one. The metaballs stay where they are: their centres in the bones' axes change. A joint
-whose clicks are further away than (1) and (2) explain is in a wrong pose, and not in another place.
+r is the thickness of the flesh at the joint. The priors of L are those of the fit, about lengths that follow the usual places. σ is
+estimated from how well the rays of the clicks meet, with the knob `click_sigma_px` as `PRIOR_FREEDOM` further observations. Unknown are d,
+the bone lengths L with their priors, and p_t, which are eliminated frame by frame. In (3) the frames within `CORRELATION_S` count as one.
+The metaballs stay where they are: their centres in the bones' axes change. A joint whose clicks are further away than (1) and (2) explain
+is in a wrong pose, and not in another place.
 """
 
 from collections.abc import Sequence
@@ -70,19 +71,22 @@ def has_both_sides(joint_names: Sequence[str]) -> bool:
     return any(name.endswith(".L") and f"{name.removesuffix('.L')}.R" in joint_names for name in joint_names)
 
 
-def joints_as_clicked(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> JointPlaces | None:
-    """The places of the joints by their clicks, for a body with a motion (T, D) at `time_s` (T,) and a vector (S,); None without clicks."""
+def joints_in_place(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> JointPlaces | None:
+    """The places of the joints, for a body with a motion (T, D) at `time_s` (T,) and a vector (S,); None where nothing tells them: without
+    clicks and without usual places."""
     seen = _seen(fit, motion, vector)
-    if not seen:
+    if not seen and not fit.model.joint_places_m:
         return None
     some = np.unique(np.linspace(0, len(motion) - 1, min(FRAMES, len(motion))).round().astype(int))
     share = min(1.0, float(np.median(np.diff(time_s[some]))) / CORRELATION_S) if len(some) > 1 else 1.0
     before, motion, vector = fit.parameters.states(motion[some], vector), motion[some], vector.copy()
     lengths, shift = fit.parameters.layout.group("lengths"), np.zeros((len(fit.parameters.skeleton.joint_names), 3))
-    of_shifts = _of_shifts(fit, seen)
+    of_shifts, longer = _of_shifts(fit, seen), _longer_by_usual_places(fit)
     for _ in range(STEPS):
         states = fit.parameters.states(motion, vector)
-        A, g = _of_shape(fit, states[0], shift, of_shifts, share * len(some))
+        believed = vector.copy()
+        believed[lengths] -= longer
+        A, g = _of_shape(fit, fit.parameters.state(motion[0], believed), shift, of_shifts, share * len(some))
         frames = [_Frame.of(old, new, shift) for old, new in zip(before, states)]
         for frame in frames:
             A += share * frame.reduced[0]
@@ -164,10 +168,11 @@ class _Seen:
     M: np.ndarray
     Mu: np.ndarray
 
-    def likely(self, prior: np.ndarray) -> bool:
-        """Whether u is within (1) and (2), uᵀ (M⁻¹ + K)⁻¹ u small enough for the prior K (3, 3) of the shift."""
-        u = np.linalg.lstsq(self.M, self.Mu, rcond=SINGULAR)[0]
-        return float(u @ np.linalg.solve(np.eye(3) + self.M @ prior, self.Mu)) < 3 * FURTHEST**2
+    def likely(self, usual: np.ndarray, prior: np.ndarray) -> bool:
+        """Whether u is within (1) and (2), vᵀ (M⁻¹ + K)⁻¹ v of v = u − R m small enough for the prior m (3,), K (3, 3) of the shift."""
+        Mv = self.Mu - self.M @ self.R @ usual
+        v = np.linalg.lstsq(self.M, Mv, rcond=SINGULAR)[0]
+        return float(v @ np.linalg.solve(np.eye(3) + self.M @ prior, Mv)) < 3 * FURTHEST**2
 
 
 def _seen(fit: FitContext, motion: np.ndarray, vector: np.ndarray) -> list[_Seen]:
@@ -196,13 +201,28 @@ def _of_shifts(fit: FitContext, seen: Sequence[_Seen]) -> tuple[np.ndarray, np.n
     sides = np.array([name.removesuffix(".R").removesuffix(".L") for name in names])
     pair = (sides[:, None] == sides) & ~np.eye(len(names), dtype=bool)
     K = np.kron(np.diag((COMMON**2 + OWN**2) * r**2), np.eye(3)) + np.kron(pair * np.outer(COMMON * r, COMMON * r), MIRRORED)
-    A, g = np.linalg.inv(K), np.zeros(len(K))
+    A, usual = np.linalg.inv(K), _usual_m(fit).ravel()
+    g = A @ usual
     for s in seen:
         at = np.s_[3 * s.joint : 3 * s.joint + 3]
-        if s.likely(K[at, at]):
+        if s.likely(usual[at], K[at, at]):
             A[at, at] += s.R.T @ s.M @ s.R
             g[at] += s.R.T @ s.Mu
     return A, g
+
+
+def _usual_m(fit: FitContext) -> np.ndarray:
+    """m (J, 3) [m]."""
+    return np.array([fit.model.joint_places_m.get(name, np.zeros(3)) for name in fit.parameters.skeleton.joint_names])
+
+
+def _longer_by_usual_places(fit: FitContext) -> np.ndarray:
+    """Logarithm (B,) of how much longer the bones of the rest pose are when the joints are in their usual places."""
+    skeleton, names = fit.parameters.skeleton, fit.parameters.skeleton.joint_names
+    moved = np.array([skeleton.bones[bone].R_rest @ m for (bone, _), m in zip(skeleton.joint_bones, _usual_m(fit))])
+    ends = [(names.index(bone.head_joint), names.index(bone.tail_joint)) for bone in skeleton.bones]
+    longer_m = [bone.R_rest[:, 1] @ (moved[tail] - moved[head]) for bone, (head, tail) in zip(skeleton.bones, ends)]
+    return np.log1p(np.array(longer_m) / [bone.nominal_length_m for bone in skeleton.bones])
 
 
 def _centres_in_place(parameters: ShapeParameters, before: Sequence[BodyState], motion: np.ndarray, vector: np.ndarray) -> np.ndarray:

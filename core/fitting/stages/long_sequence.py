@@ -24,7 +24,7 @@ from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .contradicted import misplaced_limbs, widened
-from .joint_places import JointPlaces, has_both_sides, joints_as_clicked, place_sigmas
+from .joint_places import JointPlaces, has_both_sides, joints_in_place, place_sigmas
 from .limb_modes import elsewhere, of_joints
 from .pose_tracking import Checkpoints
 
@@ -68,15 +68,15 @@ class Recording:
         )
 
     def places(self, solution: Solution) -> JointPlaces | None:
-        """Where the joints lie by their clicks, if that is asked for."""
+        """Where the joints lie, if that is asked for."""
         asked, joints = self.fit.settings.place_joints, self.fit.parameters.skeleton.joint_names
         if asked == "off" or (asked == "auto" and not has_both_sides(joints)):
             return None
-        return joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s)
+        return joints_in_place(self.fit, solution.motion, solution.vector, self.time_s)
 
     def place_sigmas(self, solution: Solution, places: JointPlaces | None) -> np.ndarray:
         """Sigma (J,) [m] of where each joint lies in the body, whether it was moved to its clicks or not."""
-        found = places or joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s)
+        found = places or joints_in_place(self.fit, solution.motion, solution.vector, self.time_s)
         return place_sigmas(self.fit) if found is None else found.sigma_m
 
     def with_places(self, solution: Solution, places: JointPlaces | None) -> tuple["Recording", Solution]:
@@ -232,7 +232,7 @@ class ShapeResult:
     simplified: np.ndarray  # (S',) of the simplified body, from which the complete model is made
     vector: np.ndarray  # (S,)
     covariance: np.ndarray  # (S, S)
-    places: JointPlaces | None  # of the joints, by their clicks
+    places: JointPlaces | None  # of the joints in the body
     place_m: np.ndarray  # (J,) sigma of these places
     convergence: Convergence
 

@@ -6,7 +6,7 @@
 4. One adjustment over the whole sequence: one shape, a pose per frame, coupled over time by tracked points and weak accelerations. Frames
    whose residuals stay suspicious restart once from between their neighbours.
 5. Where the complete model is asked for, it is made from that body (`body.complete`), and step 4 is repeated with its radii.
-6. The joints move in the body to where they were clicked (`joint_places`).
+6. The joints move in the body to where they usually lie and were clicked (`joint_places`).
 
 A recording of more than `AT_ONCE` frames is adjusted stretch by stretch, so that memory does not grow with its length (`_in_stretches`).
 

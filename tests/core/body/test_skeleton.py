@@ -1,9 +1,11 @@
 """The skeleton: conventions, derivatives, mirror images, and the papers' form of the same motion."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tricap.core.body.model_file import mirrored, model_names, other_side, read_model, without
+from tricap.core.body.model_file import MODELS, mirrored, model_names, other_side, read_model, without
 from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, frames_of_bones, joint_positions
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rotation import axis_rotation
@@ -162,6 +164,25 @@ def test_left_is_the_mirror_image_of_right(side: str) -> None:
         assert np.allclose(b[name.replace(".R", ".L")], X * [-1, 1, 1]), name
     again = mirrored(left, right.name)
     assert [d.limits for d in again.skeleton.dofs] == [d.limits for d in right.skeleton.dofs]
+
+
+def test_usual_places_of_joints_are_on_both_sides_and_go_with_their_joints() -> None:
+    model = read_model("full")
+    assert model.joint_places_m["neck"][1] > 0 and {"ankle.R", "ankle.L"} <= set(model.joint_places_m)
+    for other in (mirrored(model, "full"), model):
+        for joint, place in other.joint_places_m.items():
+            assert np.allclose(model.joint_places_m[other_side(joint)], place * [-1, 1, 1]), joint
+    upper = read_model("upper_body")
+    assert set(upper.joint_places_m) == set(model.joint_places_m) & set(upper.skeleton.joint_names) < set(model.joint_places_m)
+    assert not read_model("arm.R").joint_places_m
+
+
+@pytest.mark.parametrize(("line", "said"), [("nekc = [0.0, 0.0, 0.0]", "nekc.*neck"), ("neck = [0.0, 0.0]", "place of neck")])
+def test_a_faulty_place_of_a_joint_is_refused(tmp_path: Path, line: str, said: str) -> None:
+    text = (MODELS / "full.toml").read_text().replace("neck = [0.0, 0.033, 0.0]", line)
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_model(tmp_path / "mine.toml")
 
 
 def test_layout_answers_by_name_and_names_the_nearest() -> None:

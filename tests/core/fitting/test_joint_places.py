@@ -8,7 +8,7 @@ import pytest
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.solver import Solution
-from tricap.core.fitting.stages.joint_places import has_both_sides, joints_as_clicked
+from tricap.core.fitting.stages.joint_places import has_both_sides, joints_in_place
 from tricap.core.fitting.stages.sequence import fit_sequence
 from tricap.core.fitting.stages.set_up import fit_context
 
@@ -33,7 +33,7 @@ def _true(scene, clicks: dict, **settings):
     """Context and solution with the true body."""
     fit = fit_context(_given(scene, clicks), replace(SETTINGS, **settings))
     solution = Solution(motion=scene.motion, vector=fit.parameters.vector(scene.shape), cost=0.0, iterations=1, converged=True)
-    return fit, solution, joints_as_clicked(fit, scene.motion, solution.vector, scene.time_s)
+    return fit, solution, joints_in_place(fit, scene.motion, solution.vector, scene.time_s)
 
 
 def test_a_joint_moves_to_its_clicks_and_the_flesh_stays(make_scene) -> None:
@@ -60,6 +60,43 @@ def test_clicks_where_the_joints_are_change_nothing(make_scene) -> None:
     assert np.abs(places.shift).max() < 1e-9
     _, after = places.applied(fit, solution)
     assert np.abs(after.motion - scene.motion).max() < 1e-9 and np.abs(after.vector - solution.vector).max() < 1e-9
+
+
+def _usually(fit, places: dict[str, np.ndarray]):
+    return replace(fit, model=replace(fit.model, joint_places_m=places))
+
+
+def test_a_joint_without_a_click_moves_to_its_usual_place(make_scene) -> None:
+    scene = make_scene(frames=6, click_px=0.0)
+    fit, solution, _ = _true(scene, {0: {joint: at for joint, at in scene.clicks.items() if joint != "elbow.R"}})
+    fit = _usually(fit, {"elbow.R": SHIFT})
+    places = joints_in_place(fit, scene.motion, solution.vector, scene.time_s)
+    assert places is not None
+    moved, after = places.applied(fit, solution)
+    j = scene.shape.skeleton.joint_names.index("elbow.R")
+    for before, now in zip(fit.parameters.states(scene.motion, solution.vector), moved.parameters.states(after.motion, after.vector)):
+        wanted = before.R[before.skeleton.joint_bones[j][0]] @ SHIFT
+        assert np.linalg.norm(now.joints_m[j] - before.joints_m[j] - wanted) < 0.4 * np.linalg.norm(SHIFT), "in every frame"
+
+
+def test_clicks_count_more_than_the_usual_place(make_scene) -> None:
+    scene = make_scene(frames=6, click_px=0.0)
+    fit, solution, _ = _true(scene, {0: scene.clicks} | {t: _clicked(scene, 0 * SHIFT, t) for t in (2, 4)})
+    j = scene.shape.skeleton.joint_names.index("elbow.R")
+    found = joints_in_place(_usually(fit, {"elbow.R": SHIFT}), scene.motion, solution.vector, scene.time_s)
+    assert found is not None and np.linalg.norm(found.shift[j]) < 0.5 * np.linalg.norm(SHIFT)
+
+
+def test_lengths_follow_the_usual_places(make_scene) -> None:
+    """A bone whose joint is usually further on is longer, however firm the belief in its length is."""
+    scene = make_scene(frames=4, click_px=0.0)
+    fit, solution, _ = _true(scene, {0: scene.clicks}, length_sigma=0.001)
+    fit, further = replace(fit, clicked={}), np.array([0.0, 0.02, 0.0])
+    assert joints_in_place(fit, scene.motion, solution.vector, scene.time_s) is None, "nothing tells the places"
+    found = joints_in_place(_usually(fit, {"elbow.R": further}), scene.motion, solution.vector, scene.time_s)
+    assert found is not None
+    lengths = fit.parameters.body(found.vector)[0] - fit.parameters.body(solution.vector)[0]
+    assert lengths[0] > 0.015 and lengths[1] < -0.01
 
 
 def test_clicks_far_from_a_joint_are_those_of_another_pose(make_scene) -> None:

@@ -79,3 +79,11 @@ def test_clicked_surface_is_measured_again_with_another_sigma(tmp_path: Path, sc
         settings = take_run.settings_of({}, {}, "take.toml")
         keys = [stage_keys(replace(footage[0], click_sigma_px=f.click_sigma_px), settings, tmp_path) for f in footage]
         assert (keys[0]["measure"] != keys[1]["measure"]) == again
+
+
+def test_clicks_whose_rays_do_not_meet_are_refused_without_a_distance(scenes: Any) -> None:
+    rig = scenes.three_cameras()
+    first = rig.cameras[0]
+    at_one_place = replace(rig, cameras=(first, replace(first, name="beside")))
+    with pytest.raises(InputError, match=r"elbow\.R.* do not meet.*rig\.toml"):
+        read_clicks(at_one_place, ("elbow.R",), {"elbow.R": {first.name: (300.0, 200.0), "beside": (305.0, 220.0)}}, CLICK_SIGMA_PX)
