@@ -17,7 +17,7 @@ from ...core.motion.formats.markers import Markers, metres_per, rate, write_poin
 from ...core.motion.formats.opensim import write_opensim
 from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
-from ...core.motion.sources import read_motion_source
+from ...core.motion.sources import is_of_points, read_motion_source, read_points
 from ...core.motion.tables import read_joints
 from ...core.results.folder import check_not_result, lost
 from ...core.results.outputs import check_output
@@ -38,14 +38,16 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
     """The file to write, with the ending of the format where the name has none. Skins go into a folder of any name.
 
     Raises:
-        InputError: the name has the ending of another format, or the file is an input.
+        InputError: the name has the ending of another format, the file is an input, or it exists and was not named with its ending.
     """
-    ending = file.suffix.lower()
+    named, ending = file, file.suffix.lower()
     if kind != "ply" and ending not in ENDINGS[kind]:
         if ending in OTHERS or any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
     check_output(file, [] if out is None else [out])
+    if file.name != named.name and file.exists():
+        raise InputError(f"{file.name} exists already; write the name with its ending to replace it.")
     if out is not None:
         check_not_result(file, out)
         if kind == "mot":
@@ -135,7 +137,7 @@ def _has_segments(out: Path) -> bool:
 
 
 def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:
-    """The joints of a run with their sigmas, or the heads of a motion's bones."""
+    """The joints of a run with their sigmas, the points of a file as they are, or the heads of a motion's bones."""
     if out.is_dir() and (out / "joints.csv").is_file():
         table = read_joints(out / "joints.csv")
         names = tuple(table.joints_m)
@@ -150,6 +152,8 @@ def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:
             sigma_m=sigma,
             known=known,
         )
+    if is_of_points(out):
+        return read_points(out, up=up, unit=unit)
     return heads_of(read_motion_source(out, up=up, unit=unit))
 
 

@@ -24,6 +24,8 @@ MOST_PARTS = 16  # files of which a model is made, one from the other
 MODELS = Path(__file__).with_name("models")
 MIRROR = np.array([-1.0, 1.0, 1.0])
 LOCKED = radians(0.1)  # sigma of the prior of a locked DOF
+RADII_M = (0.0005, 5.0)  # of a bone's flesh
+MOST_LENGTHS = 10.0  # of a bone, from which anything of it may be away
 OTHER_SIDE = {".R": ".L", ".L": ".R"}
 
 
@@ -271,6 +273,9 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             places |= {other_side(joint): place * MIRROR for joint, place in places.items() if joint.endswith(".R")}
             columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths)
             radii, surface, stations, open_lengths = ([*column, *(column[i] for i in right)] for column in columns)
+        _check_numbers(bones, radii, surface, stations, aside, open_lengths)
+        if table["base"] != bones[0].head_joint:
+            raise ValueError(f"its base is {shown(table['base'])}, and its first bone begins at “{bones[0].head_joint}”")
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
         return BodyModel(
             name=skeleton.name,
@@ -282,8 +287,28 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             length_sigma=np.array(open_lengths),
             joint_places_m=places,
         )
+    except InputError as error:
+        raise InputError(f"The body model {path}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks an entry or has a wrong value: {error}.") from error
+
+
+def _check_numbers(
+    bones: Sequence[Bone],
+    radii: Sequence[np.ndarray],
+    surface: Sequence[Any],
+    stations: Sequence[Any],
+    aside: Sequence[np.ndarray],
+    open_lengths: Sequence[float],
+) -> None:
+    """Raise ValueError for what no body has."""
+    for bone, r, (low, high), along, across, relative in zip(bones, radii, surface, stations, aside, open_lengths):
+        if not (np.isnan(r).all() or ((r >= RADII_M[0]) & (r <= RADII_M[1])).all()):
+            raise ValueError(f"radii_m of “{bone.name}”: {RADII_M[0]:g} to {RADII_M[1]:g} m are possible")
+        if not -MOST_LENGTHS <= low < high <= MOST_LENGTHS:
+            raise ValueError(f"surface of “{bone.name}” is {low} to {high}")
+        if not (len(along) == 3 and np.abs([*along, *np.ravel(across)]).max() <= MOST_LENGTHS and 0 <= relative <= MOST_LENGTHS):
+            raise ValueError(f"stations, aside or length_sigma of “{bone.name}” is no distance in lengths of the bone")
 
 
 def _bone(t: Mapping[str, Any], stature: float) -> Bone:

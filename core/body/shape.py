@@ -21,8 +21,8 @@ from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from .anatomy import ball_names
 from .metaballs import ACROSS, THRESHOLD, VISIBLE, Metaballs, field, field_and_derivatives, three_balls
-from .model_file import BodyModel, base_dofs, dof_from_table
-from .skeleton import Bone, Skeleton, bone_frames
+from .model_file import MOST_LENGTHS, BodyModel, base_dofs, dof_from_table
+from .skeleton import LENGTHS_M, Bone, Skeleton, bone_frames
 
 SAMPLES = 10  # of the outline, per bone
 FREE = 0.3  # sigma of the prior on ln l
@@ -255,7 +255,7 @@ def body_of(text: str, path: str = "of a checkpoint") -> BodyShape:
         raise InputError(f"{path} is not a body.toml of this version of Tricap; run the fit again.")
     try:
         return _shape(table)
-    except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
+    except (InputError, KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
         raise InputError(f"The body {path} lacks an entry or has a wrong value ({error}); run the fit again.") from error
 
 
@@ -275,6 +275,9 @@ def _shape(table: dict[str, Any]) -> BodyShape:
         for t in rows
     )
     skeleton = Skeleton(name=str(table["model"]), bones=bones, base_dofs=base_dofs(str(table["base"])))
+    lengths_m = np.array([t["length_m"] for t in rows], dtype=float)
+    if not ((lengths_m >= LENGTHS_M[0]) & (lengths_m <= LENGTHS_M[1])).all():
+        raise ValueError(f"length_m: {LENGTHS_M[0]:g} to {LENGTHS_M[1]:g} m are possible")
     names, balls = [bone.name for bone in bones], table.get("metaballs", [])
     metaballs = Metaballs(
         bone_index=np.array([names.index(t["bone"]) for t in balls], dtype=np.intp),
@@ -282,10 +285,13 @@ def _shape(table: dict[str, Any]) -> BodyShape:
         radii_m=np.array([t["radii_m"] for t in balls], dtype=float).reshape(-1, 3),
         weight=np.array([t["weight"] for t in balls], dtype=float),
     )
+    r = metaballs.radii_m
+    if not (((r > 0) & (r <= LENGTHS_M[1])).all() and (np.abs([*metaballs.centre.ravel(), *metaballs.weight]) <= MOST_LENGTHS).all()):
+        raise ValueError("radii_m, centre or weight of a metaball: no body has such a one")
     return BodyShape(
         model=str(table["model"]),
         skeleton=skeleton,
-        lengths_m=np.array([t["length_m"] for t in rows], dtype=float),
+        lengths_m=lengths_m,
         metaballs=metaballs,
         length_sigma_m=np.array([t["sigma_m"] for t in rows], dtype=float),
         radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3),

@@ -14,7 +14,7 @@ one. Mirrored limbs (.L, .R) have equal angles about x and opposite angles about
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import inf
+from math import inf, isfinite
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
 
 ROTATION_MODES = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+LENGTHS_M = (0.0005, 20.0)  # of a bone
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -37,6 +38,13 @@ class Dof:
     limits: tuple[float, float] = (-inf, inf)  # rad or m
     prior_mean: float = 0.0
     prior_sigma: float = inf
+
+    def __post_init__(self) -> None:
+        if not (self.limits[0] <= self.limits[1] and isfinite(self.prior_mean) and self.prior_sigma > 0):
+            raise InputError(
+                f"The degree of freedom “{self.name}” goes from {self.limits[0]:.4g} to {self.limits[1]:.4g} rad or m, with a prior of "
+                f"{self.prior_mean:.4g} ± {self.prior_sigma:.4g}; the first limit must be the smaller one, and the sigma above 0."
+            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -54,6 +62,9 @@ class Bone:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "R_rest", frozen(self.R_rest, (3, 3), name="R_rest"))
+        if not LENGTHS_M[0] <= self.nominal_length_m <= LENGTHS_M[1]:
+            low, high = LENGTHS_M
+            raise InputError(f"Bone “{self.name}” is {self.nominal_length_m:g} m long; {low:g} to {high:g} m are possible.")
         axes = [dof.axis for dof in self.dofs]
         if self.rotation_mode not in ROTATION_MODES or len(set(axes)) < len(axes) or not set(axes) <= set("xyz"):
             raise InputError(

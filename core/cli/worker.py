@@ -11,8 +11,8 @@ from ..run.workers import Pieces
 
 
 def main() -> None:
-    """Do the tasks until the input ends. A bug ends the process with its traceback."""
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    """Do the tasks until the input ends, or nobody reads the answers any more. A bug ends the process with its traceback."""
+    answers = os.dup(1)
     os.dup2(2, 1)  # what libraries print
     pieces = Pieces()
     with one_thread_in_linear_algebra():
@@ -22,8 +22,10 @@ def main() -> None:
                 answer = {}
             except InputError as error:
                 answer = {"error": str(error)}
-            answers.write(json.dumps(answer) + "\n")
-            answers.flush()
+            try:
+                os.write(answers, (json.dumps(answer) + "\n").encode())
+            except BrokenPipeError:
+                return
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ A file appears under its name only when it is complete: it is written under a te
 """
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -128,9 +129,10 @@ def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]
     """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
     own = {"store_version": STORE_VERSION, "arrays": sorted(arrays), CONTENT: _content(arrays)}
     text = json.dumps({**header, **own}, sort_keys=True, allow_nan=False)
-    write = np.savez_compressed if compress else np.savez
-    with written(path) as file:
-        write(file, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
+    packed, pack = io.BytesIO(), np.savez_compressed if compress else np.savez
+    pack(packed, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
+    with written(path) as file:  # not packed into the file itself: where the disk is full, the archive would try to end itself later
+        file.write(packed.getbuffer())
 
 
 def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The size in the header of an image file, read before it is decoded: a small file must not unpack to gigabytes."""
+"""What the header of an image file says before it is decoded: its size, for a small file must not unpack to gigabytes, and its pages."""
 
 import re
 import struct
@@ -7,6 +7,8 @@ JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD,
 TIFF_KINDS = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4), 16: ("Q", 8)}
 MOST_SCANS = 100  # of a progressive JPEG, each of which passes over the whole image
 MOST_ENTRIES = 4096  # of a TIFF directory
+REDUCED = 1  # bit of a TIFF directory's kind (tag 254): a preview of another image
+ANIMATED = 2  # bit of a WebP's flags
 
 
 def claimed_size(data: bytes) -> tuple[int, int] | None:
@@ -18,6 +20,19 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
             except (struct.error, IndexError, ValueError):
                 return None
     return None
+
+
+def has_several_images(data: bytes) -> bool:
+    """Whether an image file has more than one image: pages of a TIFF, previews left out, or the frames of an animation."""
+    try:
+        if data.startswith(b"\x89PNG"):
+            at = data.find(b"acTL", 0, max(data.find(b"IDAT"), 0))
+            return at > 0 and int.from_bytes(data[at + 4 : at + 8], "big") > 1
+        if data.startswith((b"II", b"MM")):
+            return _pages(data) > 1
+        return data[:4] == b"RIFF" and data[12:16] == b"VP8X" and bool(data[20] & ANIMATED)
+    except (struct.error, IndexError):
+        return False
 
 
 def _png(data: bytes) -> tuple[int, int] | None:
@@ -72,19 +87,45 @@ def _webp(data: bytes) -> tuple[int, int] | None:
 
 def _tiff(data: bytes) -> tuple[int, int] | None:
     """The largest size in the first directory of a classic or big TIFF."""
+    found = _directory(data, _first_directory(data))[0]
+    return (found[256], found[257]) if found.get(256) and found.get(257) else None
+
+
+def _pages(data: bytes) -> int:
+    """How many images a TIFF has, previews left out; at most 2 are counted."""
+    at, pages, seen = _first_directory(data), 0, set[int]()
+    while at and at not in seen and pages < 2 and len(seen) < MOST_ENTRIES:
+        seen.add(at)
+        found, at = _directory(data, at)
+        pages += not found.get(254, 0) & REDUCED
+    return pages
+
+
+def _first_directory(data: bytes) -> int:
+    order, big = _layout(data)
+    return int(struct.unpack(order + ("Q" if big else "I"), data[8:16] if big else data[4:8])[0])
+
+
+def _layout(data: bytes) -> tuple[str, bool]:
+    """The order of a TIFF's bytes, and whether it is a big one."""
     order = "<" if data[:1] == b"I" else ">"
-    big = struct.unpack(order + "H", data[2:4])[0] == 43
-    at = struct.unpack(order + ("Q" if big else "I"), data[8:16] if big else data[4:8])[0]
+    return order, struct.unpack(order + "H", data[2:4])[0] == 43
+
+
+def _directory(data: bytes, at: int) -> tuple[dict[int, int], int]:
+    """The largest kind (254), width (256) and height (257) in the directory of a TIFF there, and the place of the next or 0."""
+    order, big = _layout(data)
     count = struct.unpack(order + ("Q" if big else "H"), data[at : at + (8 if big else 2)])[0]
     at, step, value = at + (8 if big else 2), 20 if big else 12, 12 if big else 8
-    found = {256: 0, 257: 0}
+    found: dict[int, int] = {}
     for i in range(min(count, MOST_ENTRIES)):
         tag, kind = struct.unpack(order + "HH", data[at + i * step : at + i * step + 4])
-        if tag in found and kind in TIFF_KINDS:
+        if tag in (254, 256, 257) and kind in TIFF_KINDS:
             code, size = TIFF_KINDS[kind]
             place = at + i * step + value
-            found[tag] = max(found[tag], struct.unpack(order + code, data[place : place + size])[0])
-    return (found[256], found[257]) if all(found.values()) else None
+            found[tag] = max(found.get(tag, 0), struct.unpack(order + code, data[place : place + size])[0])
+    rest = data[at + count * step : at + count * step + (8 if big else 4)]
+    return found, int.from_bytes(rest, "little" if order == "<" else "big") if len(rest) == (8 if big else 4) else 0
 
 
 READERS = (

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.errors import InputError
-from .headers import claimed_size
+from .headers import claimed_size, has_several_images
 from .packets import Packets
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
@@ -311,7 +311,8 @@ def decoded(path: Path) -> np.ndarray:
     """The pixels of an image file (h, w) or (h, w, channels).
 
     Raises:
-        InputError: the file is missing, is not an image, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type of pixels.
+        InputError: the file is missing, is not an image, has several, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type
+            of pixels.
     """
     try:
         content = bounded.bytes_of(path, bounded.IMAGE_BYTES)
@@ -319,6 +320,8 @@ def decoded(path: Path) -> np.ndarray:
         raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
     _refuse_open_exr(content[:8], path)
     _refuse_size(claimed_size(content), path)
+    if has_several_images(content):
+        raise InputError(f"{path} has several images, of which only one would be measured; write each of them to a file of its own.")
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -44,9 +44,25 @@ def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
         motion = read_bvh(path, unit_m=metres_per(unit, path) if unit else None, up=up or None)
         return Motion(rig=motion.rig, fps=motion.fps, frames=motion.frames + 1, R=motion.R, head_m=motion.head_m)
     if kind in POINTS:
-        read, axes = POINTS[kind]
-        return motion_from_points(read(path, axes=axes[up], unit=unit))
+        return motion_from_points(read_points(path, up=up, unit=unit))
     raise InputError(f"{path.name} is not a motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
+
+
+def is_of_points(path: Path) -> bool:
+    """Whether a file has the ending of points (markers, joints), which have no rotations."""
+    return path.suffix.lower() in POINTS
+
+
+def read_points(path: Path, *, up: str = "", unit: str = "") -> Markers:
+    """The points in a file with such an ending; `up`, `unit`: see `read_motion_source`.
+
+    Raises:
+        InputError: see `read_motion_source`.
+    """
+    if not path.exists():
+        raise InputError(f"There is no file or folder {path}; check its name.")
+    read, axes = POINTS[path.suffix.lower()]
+    return read(path, axes=axes[up], unit=unit)
 
 
 def from_run(out: Path) -> Motion:

@@ -184,6 +184,23 @@ def test_a_blend_file_goes_out(empty: ModuleType, tmp_path: Path, kind: str) -> 
         np.testing.assert_allclose(read_motion_source(file).head_m[:, 0], source.head_m[:, 0], atol=1e-5)
 
 
+def test_points_go_from_file_to_file_whole(small_run: SmallRun, tmp_path: Path) -> None:
+    """Not as a skeleton that they suggest, which has fewer joints."""
+    first, again, table = (tmp_path / name for name in ("a.trc", "b.c3d", "c.csv"))
+    export_file(small_run.out, "trc", first, "plain", Monitor())
+    export_file(first, "c3d", again, "plain", Monitor())
+    export_file(again, "csv", table, "plain", Monitor())
+    wanted, found = points_of(small_run.out), points_of(table)
+    assert found.names == wanted.names and np.allclose(found.xyz_m, wanted.xyz_m, atol=2e-6)
+
+
+def test_a_file_that_was_not_named_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine.bvh").write_text("a motion of somebody")
+    with pytest.raises(InputError, match=r"mine\.bvh exists already"):
+        named_for("bvh", tmp_path / "mine", None)
+    assert named_for("bvh", tmp_path / "mine.bvh", None) == tmp_path / "mine.bvh"
+
+
 def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLTF"): "a.GLTF", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
     assert {key: named_for(key[0], Path(key[1]), tmp_path).name for key in named} == named

@@ -49,6 +49,9 @@ def test_weights_that_were_fitted_keep_their_sigmas(tmp_path: Path) -> None:
         ("= [", "= [["),
         ('bone = "forearm.R"', 'bone = "nose"'),
         ("weight = 1.0", 'weight = "much"'),
+        ("length_m = 0", "length_m = -0"),
+        ("radii_m = [0", "radii_m = [1e300"),
+        ("centre = [0", "centre = [nan"),
     ],
 )
 def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:

@@ -185,6 +185,28 @@ def test_a_faulty_place_of_a_joint_is_refused(tmp_path: Path, line: str, said: s
         read_model(tmp_path / "mine.toml")
 
 
+@pytest.mark.parametrize(
+    ("entry", "wrong", "said"),
+    [
+        ("length_per_stature = 0.186", "length_per_stature = nan", "Bone “upper_arm.R” is nan m long"),
+        ("length_per_stature = 0.186", "length_per_stature = 1e300", "Bone “upper_arm.R” is .* m long"),
+        ("length_per_stature = 0.186", "length_per_stature = -1", "Bone “upper_arm.R” is -1.75 m long"),
+        ("[-90.0, 200.0]", "[200.0, -90.0]", "“shoulder.R flexion” goes from 3.49 to -1.57"),
+        ("prior_sigma_deg = 60.0", "prior_sigma_deg = 0", "“shoulder.R twist”.*sigma above 0"),
+        ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [0, 0, 0]", "radii_m of “upper_arm.R”"),
+        ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [1e9, 1, 1]", "radii_m of “upper_arm.R”"),
+        ("surface = [", "surface = [0.9, 0.3] # [", "surface of “upper_arm.R” is 0.9 to 0.3"),
+        ('base = "', 'base = "zz" # "', "base is .*zz.*shoulder.R"),
+    ],
+)
+def test_a_model_of_no_body_is_refused_when_it_is_read(tmp_path: Path, entry: str, wrong: str, said: str) -> None:
+    text = (MODELS / "arm.R.toml").read_text()
+    assert entry in text
+    (tmp_path / "mine.toml").write_text(text.replace(entry, wrong, 1))
+    with pytest.raises(InputError, match=f"mine.toml.*{said}"):
+        read_model(tmp_path / "mine.toml")
+
+
 def test_layout_answers_by_name_and_names_the_nearest() -> None:
     skeleton = read_model("arm.R").skeleton
     assert skeleton.layout["elbow.R flexion"] == 6

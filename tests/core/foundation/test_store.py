@@ -4,6 +4,8 @@ import json
 import math
 import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -211,3 +213,25 @@ def test_bytes_that_are_no_text_are_read_back_from_json(tmp_path: Path) -> None:
     value = {"take": b"k\xff\xc3\xa9".decode("utf-8", "surrogateescape")}
     store.write_json(tmp_path / "a.json", value)
     assert store.read_json(tmp_path / "a.json") == value
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+try:
+    store.save(Path(sys.argv[1]), {"a": np.random.default_rng(0).random(10_000)}, {})
+except InputError:
+    print("full")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits of files are those of POSIX")
+def test_a_full_disk_is_an_error_and_no_more(tmp_path: Path) -> None:
+    """zipfile would end the archive later, in a file that is closed by then, with a traceback of its own."""
+    done = subprocess.run([sys.executable, "-P", "-c", FULL, tmp_path / "a.npz"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "full\n", "") and not list(tmp_path.iterdir())

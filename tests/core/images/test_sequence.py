@@ -1,6 +1,8 @@
 """Reading footage: every kind of image, movies, natural order, gaps, and files that are not what they say."""
 
+import struct
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.images import sequence
+from tricap.core.images.headers import has_several_images
 from tricap.core.images.sequence import ImageFiles, Movie, decoded, grey, open_sequence, read_image
 
 RAMP = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 21
@@ -342,3 +345,42 @@ def test_a_file_that_is_no_image_is_in_memory_once(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 1.5 * (32 << 20)
     finally:
         tracemalloc.stop()
+
+
+def _png_chunk(kind: bytes, body: bytes) -> bytes:
+    return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+
+def test_a_file_with_several_images_is_refused(tmp_path: Path) -> None:
+    """Pages of a TIFF, an animated PNG, an animated WebP; one page, and a page with its preview, are images like others."""
+    image = np.full((20, 30), 90, np.uint8)
+    single = cv2.imencode(".tiff", image)[1].tobytes()
+    cv2.imwritemulti(str(tmp_path / "pages.tiff"), [image, image, image])
+    pages = (tmp_path / "pages.tiff").read_bytes()
+    preview = bytearray(pages)
+    second = struct.unpack("<I", pages[4:8])[0]
+    (entries,) = struct.unpack("<H", pages[second : second + 2])
+    second = struct.unpack("<I", pages[second + 2 + 12 * entries :][:4])[0]
+    (entries,) = struct.unpack("<H", pages[second : second + 2])
+    kinds = [second + 2 + 12 * i for i in range(entries) if pages[second + 2 + 12 * i :][:2] == struct.pack("<H", 254)]
+    preview[kinds[0] + 8 : kinds[0] + 12] = struct.pack("<I", 1)
+    preview[second + 2 + 12 * entries : second + 6 + 12 * entries] = bytes(4)  # and no third page
+    png = cv2.imencode(".png", image)[1].tobytes()
+    animated = png[:33] + _png_chunk(b"acTL", struct.pack(">II", 2, 0)) + png[33:]
+    webp = b"RIFF" + struct.pack("<I", 22) + b"WEBPVP8X" + struct.pack("<I", 10) + bytes([2, 0, 0, 0, 29, 0, 0, 19, 0, 0])
+    for name, content, several in (
+        ("single.tiff", single, False), ("pages.tiff", pages, True), ("preview.tiff", bytes(preview), False),
+        ("still.png", png, False), ("animated.png", animated, True), ("animated.webp", webp, True),
+    ):  # fmt: skip
+        path = tmp_path / name
+        path.write_bytes(content)
+        if several:
+            with pytest.raises(InputError, match=f"{name} has several images.*a file of its own"):
+                decoded(path)
+        else:
+            assert (decoded(path) == image).all(), name
+
+
+def test_a_loop_of_pages_ends() -> None:
+    pages = bytearray(struct.pack("<2sHI", b"II", 42, 8) + struct.pack("<H", 1) + struct.pack("<HHII", 254, 4, 1, 1) + struct.pack("<I", 8))
+    assert not has_several_images(bytes(pages))

@@ -1,6 +1,7 @@
 """Workers measure the frames of a take: the same bytes for any number of them, one sentence for what is wrong, and nothing runs on."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -120,6 +121,17 @@ runpy.run_module("tricap.core.cli.worker", run_name="__main__")"""
         path.unlink()
     with pytest.raises(InputError, match="died 1 times"):
         measured(plane_take, tmp_path / "other", Engine(workers=1, retries=0))
+
+
+def test_a_worker_whose_run_is_gone_ends_without_a_word(tmp_path: Path) -> None:
+    command, environment = python_command("core.cli.worker")
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    worker = subprocess.Popen(command, env=os.environ | environment, **pipes)  # type: ignore[call-overload]
+    worker.stdout.close()  # nobody reads its answers
+    refused = {"take": str(tmp_path), "frames": [0, 1], "delay_images": [], "settings": {"nothing": 1}, "keys": {}}
+    refused["settings"] = {name: {} for name in workers.SETTINGS}
+    said = worker.communicate((json.dumps(refused) + "\n").encode())[1]
+    assert worker.returncode == 0 and said == b""
 
 
 def test_a_task_is_plain_text(plane_take: Path, tmp_path: Path) -> None:
