@@ -191,7 +191,7 @@ def test_a_faulty_place_of_a_joint_is_refused(tmp_path: Path, line: str, said: s
         ("length_per_stature = 0.186", "length_per_stature = nan", "Bone “upper_arm.R” is nan m long"),
         ("length_per_stature = 0.186", "length_per_stature = 1e300", "Bone “upper_arm.R” is .* m long"),
         ("length_per_stature = 0.186", "length_per_stature = -1", "Bone “upper_arm.R” is -1.75 m long"),
-        ("[-90.0, 200.0]", "[200.0, -90.0]", "“shoulder.R flexion” goes from 3.49 to -1.57"),
+        ("[-90.0, 200.0]", "[200.0, -90.0]", "“shoulder.R flexion” goes from 3.491 to -1.571"),
         ("prior_sigma_deg = 60.0", "prior_sigma_deg = 0", "“shoulder.R twist”.*sigma above 0"),
         ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [0, 0, 0]", "radii_m of “upper_arm.R”"),
         ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [1e9, 1, 1]", "radii_m of “upper_arm.R”"),
