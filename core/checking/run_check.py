@@ -82,9 +82,8 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
         return [wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
     incomplete = lost(folder, run)
     for stage, files in NEEDED.items():
-        if "not_done" in run["stages"].get(stage, {}) or stage not in run["stages"]:
-            continue
-        gone = [name for name in files if not (folder / name).exists()]
+        done = "not_done" not in run["stages"].get(stage, {"not_done": True})
+        gone = [name for name in files if done and not (folder / name).exists()]
         less = [name for name in incomplete.get(stage, []) if name not in gone]
         if gone:
             findings.append(wrong(Cause.FILES_MISSING, f"{', '.join(gone)} of the stage “{stage}” is missing in {folder}.", again))

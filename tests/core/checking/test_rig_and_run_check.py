@@ -112,6 +112,12 @@ def skin_gone(folder: Path) -> None:
     shutil.rmtree(folder / "out" / "skin")
 
 
+def frames_cut_without_body(folder: Path) -> None:
+    """The table of the frames belongs to every run, also where no body was asked for."""
+    edit(folder, lambda run: run["stages"]["fit"].update(not_done="no body was asked for"))
+    (folder / "out" / "frames.csv").write_text("")
+
+
 def take_changed(folder: Path) -> None:
     with open(folder / "take" / "take.toml", "a") as file:
         file.write("# another thought\n")
@@ -166,6 +172,7 @@ def damaged(folder: Path) -> None:
 
 
 RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "files missing", skin_gone: "files missing",
+           frames_cut_without_body: "files missing",
            take_changed: "stale result", thin: "coverage", unsure: "large sigma", bare_forearm: "coverage",
            unsure_angle: "large sigma", warned: "warning",
            rays: "rays miss", damaged: "input"}  # fmt: skip
