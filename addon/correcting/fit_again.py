@@ -48,10 +48,20 @@ class FitAgain(StageOperator, bpy.types.Operator):
         for body in all_bodies(context.scene):
             move_keys(body, result)
         results.clear()
+        _mark_again(context.scene)
         canvas.redraw_clips(context)
         context.scene.frame_set(context.scene.frame_current)
         self.report({"INFO"}, str(result))
         return {"FINISHED"}
+
+
+def _mark_again(scene: bpy.types.Scene) -> None:
+    """Let the markers in the timeline be those of the new results."""
+    from ..scene.build import mark_doubtful
+    from ..scene.contents import doubtful_in
+
+    if (run := results.current(scene)) is not None:
+        mark_doubtful(scene, doubtful_in(run.out, []))
 
 
 def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:

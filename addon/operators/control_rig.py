@@ -23,7 +23,8 @@ def body_of(context: bpy.types.Context, *, standing_only: bool = True) -> bpy.ty
 
 
 class MakeControlRig(TellingOperator, bpy.types.Operator):
-    """Make controls with IK and FK by Rigify. The measured motion is their base layer, with an empty layer for corrections over it"""
+    """Make controls by Rigify: IK and FK, fingers and toes. The measured motion is their base layer, with an empty layer for corrections
+    over it"""
 
     bl_idname = "tricap.make_control_rig"
     bl_label = "Make Control Rig"

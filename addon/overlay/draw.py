@@ -238,7 +238,7 @@ def _draw_graph(run: RunResults, frame: int, sheet: Canvas) -> None:
     first, last = int(table.frames[0]), max(int(table.frames[-1]), int(table.frames[0]) + 1)
     x = left + (table.frames - first) / (last - first) * width
     _draw_curves(table, x, left, bottom, height)
-    _, why = table.badness()
+    _, why = run.doubt()
     doubtful = [i for i, reason in enumerate(why) if reason]
     if doubtful:
         ticks = np.array([[(x[i], bottom), (x[i], bottom + 0.25 * height)] for i in doubtful])

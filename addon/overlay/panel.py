@@ -87,9 +87,9 @@ class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):
         """A row per frame: its number, why it is doubtful, residual and sigma."""
         run = results.current(context.scene)
         table = run.table() if run is not None else None
-        if table is None:
+        if run is None or table is None:
             return
-        badness, reasons = table.badness()
+        badness, reasons = run.doubt()
         layout = self.layout
         if not any(reasons):
             layout.label(text="No frame is doubtful.", icon="CHECKMARK")

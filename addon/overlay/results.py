@@ -91,6 +91,17 @@ class RunResults:
         path = self.out / "frames.csv"
         return self.cached("table", lambda: read_frame_table(path) if path.is_file() else None)
 
+    def doubt(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """How doubtful the frames of the table are (T,), and why, "" unless they are; empty without a table."""
+        from ...core.motion.tables import read_guessed
+        from ...core.run.record import doubt
+
+        table, joints = self.table(), self.out / "joints.csv"
+        guessed = self.cached("guessed", lambda: read_guessed(joints) if joints.is_file() else {})
+        if table is None:
+            return np.zeros(0), ()
+        return self.cached("doubt", lambda: doubt(table, guessed or {}))  # type: ignore[no-any-return]
+
     def has(self, key: Any) -> bool:
         """Whether something is cached."""
         return key in self._read
@@ -148,7 +159,7 @@ def _key(scene: bpy.types.Scene) -> tuple[Any, ...]:
     watched = [
         folder / "take.toml",
         folder / "rig.toml",
-        *(out / name for name in ("run.json", "frames.csv", "contours", "outlines", "points2d.csv")),
+        *(out / name for name in ("run.json", "frames.csv", "joints.csv", "contours", "outlines", "points2d.csv")),
     ]
     return folder, out, *(path.stat().st_mtime_ns if path.exists() else 0 for path in watched)
 

@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 CONSTRAINT = "Control rig"
 DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
 CORRECTIONS = "Corrections"
+TOE = "toe"
 LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
 CHECKED_FRAMES = 25
+RESTING_RAD = 1e-4  # rotation of a finger or toe that does not leave its rest
 MOST_TURNS, SMALLEST_TURN_RAD = 6, 1e-5  # of the base of an IK limb, until its middle joint is where it was
 NEEDED = {"ctrl_bones", "tail_bones"}  # of the arguments of Rigify's snapping
 
@@ -54,6 +56,11 @@ def control_of(bone: str) -> str:
     """The FK control of a bone of the body."""
     part, _, side = bone.partition(".")
     return f"{part}_fk.{side}" if any(part in chain for chain in metarig.LIMBS.values()) else bone
+
+
+def driven_bones(body: bpy.types.Object) -> tuple[str, ...]:
+    """The bones of a body, below its root, that copy those of a control rig."""
+    return (*metarig.needed_bones(), *metarig.digits_of(body))
 
 
 def make_control_rig(body: bpy.types.Object) -> Made:
@@ -129,15 +136,22 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
 
 
 def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:
-    rotation = {name: _bent(rig, body, name) for name in metarig.needed_bones()}
+    names, digits = driven_bones(body), metarig.digits_of(body)
+    unused = metarig.unused_bones(rig, body)
+    for name in digits:
+        rig.pose.bones[control_of(name)].custom_shape_transform = None  # an unused bone
+        rig.pose.bones[control_of(name)].lock_location = (True, True, True)
+    rotation = {name: _bent(rig, body, name) for name in names}
     bpy.ops.object.select_all(action="DESELECT")
     bpy.context.view_layer.objects.active = rig
     rig.select_set(True)
     bpy.ops.object.mode_set(mode="EDIT")
     bones = rig.data.edit_bones
-    for name in (ROOT, *metarig.needed_bones()):
+    for name in unused:
+        bones.remove(bones[name])
+    for name in (ROOT, *names):
         bone, rest = bones.new(DRIVE + name), np.array(body.data.bones[name].matrix_local)
-        parent = bones[ROOT if name == ROOT else f"ORG-{name}"]
+        parent = bones[ROOT if name == ROOT else control_of(name) if name in digits else f"ORG-{name}"]
         bone.length, bone.parent, bone.use_deform = body.data.bones[name].length, parent, False
         matrix = np.eye(4)
         matrix[:3, :3] = rest[:3, :3] if name == ROOT else rotation[name].T @ rest[:3, :3]
@@ -146,7 +160,7 @@ def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:
     bpy.ops.object.mode_set(mode="OBJECT")
     hidden = rig.data.collections.new("Body")
     hidden.is_visible = False
-    for name in (ROOT, *metarig.needed_bones()):
+    for name in (ROOT, *names):
         hidden.assign(rig.data.bones[DRIVE + name])
 
 
@@ -156,14 +170,14 @@ def _bent(rig: bpy.types.Object, body: bpy.types.Object, name: str) -> np.ndarra
 
 def _key_controls(rig: bpy.types.Object, body: bpy.types.Object, motion: Motion) -> None:
     """Write the motion as keys of root and FK controls, push them to an NLA strip, and begin an empty action over it."""
-    names = metarig.needed_bones()
+    names = driven_bones(body)
     follows = {control_of(name): control_of(_parent(name)) for name in names if name != "pelvis"} | {"pelvis": ROOT}
     limbs = {f"{chain[0]}_parent.{side}": LIMB_PROPERTIES for chain in metarig.LIMBS.values() for side in "LR"}
     chains = {name: (control_of(name),) for name in names} | {ROOT: (ROOT,)}
     whole = read_rig(rig)
     controls = controls_of(whole, ControlRig(follows=follows, properties=limbs), chains)
     R, place = _targets(controls, body, rig, motion)
-    result = _result(controls, motion, R, place)
+    result = _result(controls, motion, R, place, {control_of(name) for name in metarig.digits_of(body)})
     written = write_action(rig, result, "Measured motion", properties=limbs)
     push_to_strip(rig, written.action)
     rig.animation_data.nla_tracks[-1].lock = True
@@ -173,7 +187,12 @@ def _key_controls(rig: bpy.types.Object, body: bpy.types.Object, motion: Motion)
 
 def _parent(name: str) -> str:
     """The parent of a bone of the body."""
-    part, dot, side = name.partition(".")
+    part, _, side = name.partition(".")
+    if part == TOE:
+        return f"foot.{side}"
+    if part in metarig.FINGERS:  # side: "02.R"
+        number, _, side = side.partition(".")
+        return f"hand.{side}" if number == "01" else f"{part}.0{int(number) - 1}.{side}"
     for limb, chain in metarig.LIMBS.items():
         if part in chain[1:]:
             return f"{chain[chain.index(part) - 1]}.{side}"
@@ -184,7 +203,7 @@ def _parent(name: str) -> str:
 
 def _targets(controls: Rig, body: bpy.types.Object, rig: bpy.types.Object, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """World rotations (T, B, 3, 3) and heads (T, B, 3) of the controls that place the body as in `motion`.  (1)"""
-    bone_of = {control_of(name): name for name in metarig.needed_bones()} | {ROOT: ROOT}
+    bone_of = {control_of(name): name for name in driven_bones(body)} | {ROOT: ROOT}
     rows = [motion.rig.index[bone_of[control]] for control in controls.names]
     since_rest = motion.R[:, rows] @ transposed(motion.rig.R_rest[rows])
     A = np.array([np.eye(3) if control == ROOT else _bent(rig, body, bone_of[control]) for control in controls.names])
@@ -192,21 +211,24 @@ def _targets(controls: Rig, body: bpy.types.Object, rig: bpy.types.Object, motio
     return since_rest @ object_R @ A @ object_R.T @ controls.R_rest, motion.head_m[:, rows]
 
 
-def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray) -> "Retargeted":
-    """The root keeps to the floor under the person; the pelvis carries the rest."""
+def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray, digits: set[str]) -> "Retargeted":
+    """The root keeps to the floor under the person; the pelvis carries the rest. Fingers and toes (`digits`) that do not leave their rest
+    get no keys, so that a pose of the animator's stays in all frames."""
     root, pelvis = controls.index[ROOT], controls.index["pelvis"]
     path = place[:, root] - controls.head_m[root]
     shift = place[:, pelvis] - (controls.head_m[pelvis] + path)
     played = Motion(rig=controls, fps=motion.fps, frames=motion.frames, R=R, head_m=place)
     from ...core.motion.retarget.retarget import Retargeted
 
+    basis = channels(controls, R)
+    resting = angle_of(basis).max(axis=0) < RESTING_RAD
     return Retargeted(
         motion=played,
-        basis=channels(controls, R),
+        basis=basis,
         shift_m=shift,
         carrier=pelvis,
         loose_m={root: path},
-        driven=np.ones(len(controls.names), dtype=bool),
+        driven=np.array([name not in digits or not rests for name, rests in zip(controls.names, resting)]),
         scale=1.0,
         roles=(),
         contacts=None,
@@ -216,9 +238,10 @@ def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray) -> 
 
 
 def _drive(body: bpy.types.Object, rig: bpy.types.Object) -> None:
-    """Let each bone of the body copy its bone of the control rig."""
-    for name in (ROOT, *metarig.needed_bones()):
-        constraint = body.pose.bones[name].constraints.new("COPY_TRANSFORMS")
+    """Let each bone of the body copy its bone of the control rig; fingers and toes, which begin at bones of the body, its rotation only."""
+    digits = metarig.digits_of(body)
+    for name in (ROOT, *driven_bones(body)):
+        constraint = body.pose.bones[name].constraints.new("COPY_ROTATION" if name in digits else "COPY_TRANSFORMS")
         constraint.name, constraint.target, constraint.subtarget = CONSTRAINT, rig, DRIVE + name
 
 

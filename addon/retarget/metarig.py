@@ -2,7 +2,10 @@
 
 The bones have the body's names. Pelvis, spine, chest, neck, head and shoulders get one control each; arms and legs are Rigify's limbs with
 IK and FK. A solver of IK needs a bent limb: elbows and knees are moved by BEND_M, so that their bones deviate by about a degree from those
-of the body, and are longer by BEND_M² / (2 length), 0.05 mm.
+of the body, and are longer by BEND_M² / (2 length), 0.05 mm. A foot ends where the body's toes begin, so that they turn about the ball.
+
+A finger has a control for each bone, whose rotation the body's bone copies, and a master: its scale along y curls the finger. Rigify's own
+bones of a finger, which it stretches from control to control, do not have the twist of the first control; they are removed.
 """
 
 import bpy
@@ -15,6 +18,7 @@ BEND_M = 0.005
 TOE_M, HEEL_M, HEEL_WIDTH_M = 0.06, 0.05, 0.08
 SINGLE = ("pelvis", "spine", "chest", "neck", "head", "shoulder.L", "shoulder.R")  # bones with a control of their own
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
+FINGERS = ("thumb", "f_index", "f_middle", "f_ring", "f_pinky")  # of three bones: thumb.01.R to thumb.03.R
 PARENTS = {"spine": "pelvis", "chest": "spine", "neck": "chest", "head": "neck", "shoulder": "chest", "arm": "shoulder", "leg": "pelvis"}
 PREFIX = "Metarig of "
 
@@ -22,6 +26,25 @@ PREFIX = "Metarig of "
 def needed_bones() -> tuple[str, ...]:
     """The bones that a body needs for a control rig."""
     return (*SINGLE, *(f"{bone}.{side}" for side in "LR" for bones in LIMBS.values() for bone in bones))
+
+
+def fingers_of(body: bpy.types.Object, side: str) -> list[tuple[str, ...]]:
+    """The bones of each finger that a body has."""
+    chains = [tuple(f"{finger}.0{k}.{side}" for k in (1, 2, 3)) for finger in FINGERS]
+    return [chain for chain in chains if all(name in body.data.bones for name in chain)]
+
+
+def digits_of(body: bpy.types.Object) -> tuple[str, ...]:
+    """The bones of a body's fingers and toes, parents first; none of a body without a modelled skin."""
+    toes = [name for name in ("toe.L", "toe.R") if name in body.data.bones]
+    return (*(name for side in "LR" for chain in fingers_of(body, side) for name in chain), *toes)
+
+
+def unused_bones(rig: bpy.types.Object, body: bpy.types.Object) -> list[str]:
+    """The bones of a generated rig's fingers that move nothing: those that stretch, and the controls of the tips that they end at."""
+    chains = [chain for side in "LR" for chain in fingers_of(body, side)]
+    names = [f"{prefix}{name}" for chain in chains for name in chain for prefix in ("ORG-", "MCH-", "DEF-")]
+    return [name for name in (*names, *(f"{chain[0]}.001" for chain in chains)) if name in rig.data.bones]
 
 
 def add_metarig(body: bpy.types.Object, collection: bpy.types.Collection) -> bpy.types.Object:
@@ -48,7 +71,10 @@ def add_metarig(body: bpy.types.Object, collection: bpy.types.Collection) -> bpy
                 _copy(metarig, body, f"{bone}.{side}", parent, connected=bone != chain[0])
                 parent = f"{bone}.{side}"
             _bend(metarig, *(f"{bone}.{side}" for bone in chain[:2]))
-        _add_toe_and_heel(metarig, side)
+        _add_toe_and_heel(metarig, body, side)
+        for finger in fingers_of(body, side):
+            for name, parent in zip(finger, (f"hand.{side}", *finger)):
+                _copy(metarig, body, name, parent, connected=name != finger[0])
     bpy.ops.object.mode_set(mode="OBJECT")
     _set_types(metarig)
     return metarig
@@ -70,25 +96,26 @@ def _bend(metarig: bpy.types.Object, upper: str, lower: str) -> None:
     bones[upper].tail = bones[lower].head = joint
 
 
-def _add_toe_and_heel(metarig: bpy.types.Object, side: str) -> None:
-    bones = metarig.data.edit_bones
+def _add_toe_and_heel(metarig: bpy.types.Object, body: bpy.types.Object, side: str) -> None:
+    bones, own = metarig.data.edit_bones, body.data.bones.get(f"toe.{side}")
     foot = bones[f"foot.{side}"]
+    if own is not None:
+        foot.tail = own.head_local
     forward = Vector((foot.vector.x, foot.vector.y, 0.0)).normalized()
     toe, heel = bones.new(f"toe.{side}"), bones.new(f"heel.02.{side}")
-    toe.head, toe.tail, toe.parent, toe.use_connect = foot.tail, foot.tail + TOE_M * forward, foot, True
+    toe.head, toe.tail = foot.tail, foot.tail + TOE_M * forward if own is None else own.tail_local
+    toe.parent, toe.use_connect = foot, True
     back = Vector((foot.head.x, foot.head.y, 0.0)) - HEEL_M * forward
     across = 0.5 * HEEL_WIDTH_M * Vector((1.0, 0.0, 0.0))
     heel.head, heel.tail, heel.parent = back - across, back + across, foot
 
 
 def _set_types(metarig: bpy.types.Object) -> None:
-    for row, name in enumerate(("Torso", "Arm.L", "Arm.R", "Leg.L", "Leg.R"), 1):
+    for row, name in enumerate(dict.fromkeys(_group(bone.name) for bone in metarig.data.bones), 1):
         collection = metarig.data.collections.new(name)
         collection.rigify_ui_row = row
-        side, limb = name[-2:], LIMBS.get(name[:-2].lower())
         for bone in metarig.data.bones:
-            part = bone.name[:-2] if bone.name.endswith((".L", ".R")) else bone.name
-            if (bone.name in SINGLE) if limb is None else bone.name.endswith(side) and (part in limb or _is_foot(part) and "Leg" in name):
+            if _group(bone.name) == name:
                 collection.assign(bone)
     for name in SINGLE:
         bone = metarig.pose.bones[name]
@@ -99,13 +126,25 @@ def _set_types(metarig: bpy.types.Object) -> None:
             bone = metarig.pose.bones[f"{chain[0]}.{side}"]
             bone.rigify_type = f"limbs.{limb}"
             bone.rigify_parameters.segments = bone.rigify_parameters.bbones = 1
+        for finger in fingers_of(metarig, side):
+            bone = metarig.pose.bones[finger[0]]
+            bone.rigify_type = "limbs.super_finger"
+            bone.rigify_parameters.primary_rotation_axis, bone.rigify_parameters.bbones = "X", 1  # the body's fingers flex about x
 
 
-def _is_foot(part: str) -> bool:
-    return part in ("toe", "heel.02")
+def _group(name: str) -> str:
+    """The bone collection of a bone of the metarig."""
+    part, side = name.split(".")[0], name[-2:]
+    if part in FINGERS:
+        return f"Fingers{side}"
+    limb = next((limb for limb, chain in LIMBS.items() if part in chain or (limb == "leg" and part in ("toe", "heel"))), "")
+    return f"{limb.capitalize()}{side}" if limb else "Torso"
 
 
 def bent_rest(body: bpy.types.Object, controls: bpy.types.Object, name: str, control: str) -> np.ndarray:
-    """A (3, 3): rotates the rest direction of a control to that of the body's bone."""
+    """A (3, 3): rotates the rest direction of a control to that of the body's bone, where the metarig moved the joint between two bones.
+    Other controls rotate as the body's bones, whatever their direction."""
+    if not any(name[:-2] in chain[:2] for chain in LIMBS.values()):
+        return np.eye(3)
     here, there = (np.array(o.data.bones[bone].matrix_local)[:3, 1] for o, bone in ((body, name), (controls, control)))
     return np.array(Vector(there).rotation_difference(Vector(here)).to_matrix())

@@ -17,7 +17,7 @@ PRESETS = Path(__file__).resolve().parent.parent / "presets"
 class Program:
     """`names`: a file in presets/ with the names of bones; `prefix`: in front of them, None for the prefix in that file; `unit` and `axes`
     (see core.motion.markers): empty for those of the format; `bvh_order`: the order of BVH's rotation channels; `root`: the name of the
-    bone that carries the path, which is added where the rig has none."""
+    bone that carries path and heading, which is added where the rig has none."""
 
     names: str = ""
     prefix: str | None = None
@@ -64,7 +64,7 @@ def bone_names(rig: Rig, program: Program) -> dict[str, str]:
 
 
 def rooted(motion: Motion, program: Program) -> Motion:
-    """The motion with a bone that carries the path, if the program needs one and the body has legs but no such bone."""
+    """The motion with a bone that carries path and heading, if the program needs one and the body has legs."""
     return with_root(motion, find_map(motion.rig, presets()), program.root) if program.root else motion
 
 

@@ -21,7 +21,7 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.motion.formats.ply import Ply, read_ply
-from ...core.motion.tables import MotionTable, read_motion
+from ...core.motion.tables import MotionTable, read_guessed, read_motion
 from ...core.results.run_json import read_run
 from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
@@ -111,10 +111,25 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: 
         skin_settings=settings,
         prepared=prepared,
         skins=_skins(person, motion, settings, monitor, warnings) if skins else None,
-        doubtful=tuple(doubtful_stretches(read_frame_table(out / "frames.csv"))) if (out / "frames.csv").is_file() else (),
+        doubtful=doubtful_in(out, warnings),
         bar=_bar(footage, warnings),
         warnings=tuple(warnings),
     )
+
+
+def doubtful_in(out: Path, warnings: list[str]) -> tuple[tuple[int, int, str], ...]:
+    """The doubtful stretches of the results in OUT: first and last frame, and the reason; those of tables that there are.
+
+    Raises:
+        InputError: frames.csv is damaged.
+    """
+    frames, joints = out / "frames.csv", out / "joints.csv"
+    table, guessed = read_frame_table(frames) if frames.is_file() else None, dict[str, tuple[int, ...]]()
+    try:
+        guessed = read_guessed(joints) if joints.is_file() else guessed
+    except InputError as error:
+        warnings.append(f"No markers of guessed limbs in the scene: {error}")
+    return tuple(doubtful_stretches(table, guessed))
 
 
 def _bar(footage: Footage | None, warnings: list[str]) -> tuple[np.ndarray, np.ndarray] | None:

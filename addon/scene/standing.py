@@ -4,8 +4,9 @@ A whole body rests with its soles at z = 0 of its armature, whose object stands 
 path: its location is where the base of the skeleton is, seen from above. The height belongs to the base bone, the pelvis. So the channels
 are the degrees of freedom of motion.csv, but for a constant in the height.
 
-The path is two F-curves (x and y), which can be moved to the armature object, as game engines expect root motion, or muted, so that the
-person moves in place. Edited keys stay.
+The path is two F-curves (x and y), which can be moved to the armature object, or muted, so that the person moves in place. Edited keys
+stay. The heading stays in the rotation of the pelvis, in which it is one channel with the measured sigma; exports for game engines move it
+to the root bone (`core/motion/retarget/root_motion.py`).
 """
 
 from collections.abc import Iterator
@@ -43,7 +44,11 @@ class Path(StrEnum):
 
 PATHS = (
     (Path.BONE, "Root Bone", "The root bone travels over the floor"),
-    (Path.OBJECT, "Object", "The armature object travels: root motion for game engines"),
+    (
+        Path.OBJECT,
+        "Object",
+        "The armature object travels; the heading stays in the pelvis. Files for Unreal and Unity have both in their root bone",
+    ),
     (Path.IN_PLACE, "In Place", "The person moves in place; the path is muted"),
 )
 

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body.motion import KNOWN, BodyMotion
+from ..body.limb_words import limb_joints
+from ..body.motion import GUESSED, KNOWN, BodyMotion
 from ..body.skeleton import Skeleton
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse, frozen
@@ -135,6 +136,26 @@ def read_joints(path: Path) -> JointTable:
         frame_sigma_m={joint: t[:, 4] for joint, t in tables.items()},
         known={joint: tuple(row.get(f, "") for f in frames) for joint, row in words.items()},
     )
+
+
+def read_guessed(path: Path) -> dict[str, tuple[int, ...]]:
+    """The frames in which each limb is guessed, by its name in words, from joints.csv; no limbs of a file of an earlier version.
+
+    Raises:
+        InputError: the file is missing, or these columns of it are damaged.
+    """
+    header, rows = _read(path)
+    if "known" not in header:
+        return {}
+    frame, joint, known = (_column(header, name, path) for name in ("frame", "joint", "known"))
+    joints = list(dict.fromkeys(row[joint] for row in rows))
+    limbs = limb_joints(joints)
+    limb_of = {joints[i]: limb for limb, indices in limbs.items() for i in indices}
+    found: dict[str, set[int]] = {limb: set() for limb in limbs}
+    for line, row in enumerate(rows, 2):
+        if _word(row[known], path, line) == GUESSED and row[joint] in limb_of:
+            found[limb_of[row[joint]]].add(_whole(row[frame], path, line))
+    return {limb: tuple(sorted(frames)) for limb, frames in found.items() if frames}
 
 
 def _to_file(skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:

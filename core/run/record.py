@@ -207,19 +207,40 @@ def _badness(table: FrameTable) -> tuple[np.ndarray, tuple[str, ...]]:
     return replace(table, fit=tuple("" if state in usual else state for state in table.fit)).badness()
 
 
-def doubtful_stretches(table: FrameTable) -> list[tuple[int, int, str]]:
-    """First and last frame of every run of doubtful frames, with the reason of the worst one."""
+def doubt(table: FrameTable, guessed: Mapping[str, Sequence[int]]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """How doubtful each frame of the table is (T,), as `FrameTable.badness`, and why; `guessed`: the frames in which a limb is guessed."""
     badness, reasons = _badness(table)
-    found: list[tuple[int, int, str, float]] = []
-    for frame, bad, reason in zip(table.frames.tolist(), badness.tolist(), reasons):
-        if not reason:
-            continue
+    limbs: dict[int, list[str]] = {}
+    for limb, frames in guessed.items():
+        for frame in frames:
+            limbs.setdefault(frame, []).append(limb)
+    there = [limbs.get(frame, []) for frame in table.frames.tolist()]
+    worse = np.where([len(names) > 0 for names in there], 2 * DOUBTFUL, 1.0)
+    words = tuple(f"{' and '.join(names)} guessed" if names else reason for names, reason in zip(there, reasons))
+    return np.maximum(badness, worse), words
+
+
+def doubtful_stretches(table: FrameTable | None, guessed: Mapping[str, Sequence[int]]) -> list[tuple[int, int, str]]:
+    """First and last frame of every stretch in which a limb is guessed, and of every run of doubtful frames, with the reason of the worst
+    one; in the order of the first frames."""
+    found = [(first, last, f"{limb} guessed") for limb, frames in guessed.items() for first, last in _successive(frames)]
+    if table is not None:
+        badness, reasons = _badness(table)
+        of = {int(frame): (bad, reason) for frame, bad, reason in zip(table.frames, badness.tolist(), reasons) if reason}
+        for first, last in _successive(list(of)):
+            found.append((first, last, max((of[frame] for frame in range(first, last + 1)), key=lambda row: row[0])[1]))
+    return sorted(found)
+
+
+def _successive(frames: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of every run of successive frames."""
+    found: list[tuple[int, int]] = []
+    for frame in frames:
         if found and found[-1][1] == frame - 1:
-            first, _, before, worst = found[-1]
-            found[-1] = (first, frame, *((reason, bad) if bad > worst else (before, worst)))
+            found[-1] = (found[-1][0], frame)
         else:
-            found.append((frame, frame, reason, bad))
-    return [(first, last, reason) for first, last, reason, _ in found]
+            found.append((frame, frame))
+    return found
 
 
 def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.geometry.rotation import angle_of, transposed
+from tricap.addon.scene.standing import curves_of
+from tricap.core.geometry.rotation import angle_of, transposed, twist_about
 from tricap.core.motion.formats.bvh import read_bvh
 
 from .test_scene_standing import FRAMES, walker
@@ -62,6 +63,69 @@ def bend(body: Any) -> None:
             curve = body.animation_data.action.fcurve_ensure_for_datablock(body, f'pose.bones["{name}"].rotation_euler', index=index)
             for k, point in enumerate(curve.keyframe_points):
                 point.co.y += angle * (0.8 + 0.02 * k)
+
+
+def test_fingers_and_toes_have_controls(blender: ModuleType) -> None:
+    """Their poses before, with keys or without, are reproduced; controls turn them, each about all axes; a master curls its finger."""
+    body, scene = walker(blender, fingers=True), blender.context.scene
+    bend(body)
+    rng = np.random.default_rng(5)
+    for name in ("f_index.01.R", "f_index.02.R", "thumb.01.L", "toe.L"):
+        for frame in (0, 5, FRAMES - 1):
+            body.pose.bones[name].rotation_euler = rng.normal(0, 0.4, 3)
+            body.pose.bones[name].keyframe_insert("rotation_euler", frame=frame)
+    body.pose.bones["f_pinky.01.L"].rotation_euler = (0.5, 0.2, -0.1)  # a pose without keys
+    wanted = played(blender, body)
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    rig, names = blender.data.objects["Body controls"], list(body.pose.bones.keys())
+    for found, before in zip(played(blender, body), wanted):
+        check_same(found, before, ANGLE_DEG, 1e-5)
+    (strip,) = rig.animation_data.nla_tracks[0].strips
+    keyed = {curve.data_path.split('"')[1] for curve in curves_of(strip.action)}
+    assert {"f_index.01.R", "toe.L", "f_pinky.01.L"} <= keyed and not {"f_ring.01.R", "toe.R"} & keyed, (
+        "a finger at rest is left to the animator"
+    )
+    unused = [
+        bone.name for bone in rig.data.bones if bone.name.startswith(("ORG-f_", "DEF-thumb", "MCH-f_ring.01.R")) or ".001" in bone.name
+    ]
+    assert not unused and {c.name for c in rig.data.collections_all} >= {"Fingers.L", "Fingers.R"}
+    scene.frame_set(7)
+    for to in ("IK", "FK"):
+        assert blender.ops.tricap.snap_limbs(to=to) == {"FINISHED"}
+        check_same(pose(body), wanted[7], SNAP_DEG, SNAP_M)
+        for name in ("f_ring.02.R", "thumb.01.L", "toe.R", "toe.L"):
+            for axis in range(3):
+                turned_alone(blender, rig, body, name, axis)
+    ring, before = [names.index(f"f_ring.0{k}.L") for k in (1, 2, 3)], pose(body)
+    rig.pose.bones["f_ring.01_master.L"].scale.y = 0.75
+    blender.context.view_layer.update()
+    turned = transposed(before[0][ring]) @ pose(body)[0][ring]
+    np.testing.assert_allclose(twist_about(turned, np.array([1.0, 0.0, 0.0])), np.radians([0, 45, 90]), atol=1e-4, err_msg="it flexes")
+
+
+def turned_alone(bpy: ModuleType, rig: Any, body: Any, name: str, axis: int) -> None:
+    """Turning the control of a finger or toe turns the body's bone, and none above it."""
+    control, before, at = rig.pose.bones[name], pose(body), list(body.pose.bones.keys()).index(name)
+    control.rotation_mode = "XYZ"
+    was = control.rotation_euler[axis]
+    control.rotation_euler[axis] += 0.3
+    bpy.context.view_layer.update()
+    now = pose(body)
+    control.rotation_euler[axis] = was
+    bpy.context.view_layer.update()
+    below = {child.name for child in body.data.bones[name].children_recursive} | {name}
+    others = [i for i, other in enumerate(body.pose.bones.keys()) if other not in below]
+    assert np.degrees(angle_of(before[0][at].T @ now[0][at])) == pytest.approx(np.degrees(0.3), abs=0.01)
+    check_same((now[0][others], now[1][others]), (before[0][others], before[1][others]), SNAP_DEG, SNAP_M)
+
+
+def played(bpy: ModuleType, body: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The poses of all frames."""
+    found = []
+    for frame in range(FRAMES):
+        bpy.context.scene.frame_set(frame)
+        found.append(pose(body))
+    return found
 
 
 def a_correction_is_layered_and_exported(bpy: ModuleType, rig: Any, body: Any, wanted: list[Any], folder: Path) -> None:

@@ -19,9 +19,11 @@ from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.export import export_file, exporting_played, named_for, points_of
 from tricap.addon.retarget.playing import reading_played
 from tricap.addon.retarget.read import ended
+from tricap.addon.scene.standing import Path as Carrier
+from tricap.addon.scene.standing import carry_path, dofs_of
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
-from tricap.core.geometry.rotation import about, angle_of, transposed
+from tricap.core.geometry.rotation import about, angle_of, transposed, twist_about
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
 from tricap.core.motion.formats.c3d import read_c3d, read_segments
 from tricap.core.motion.formats.markers import AXES, read_points_csv
@@ -30,6 +32,7 @@ from tricap.core.motion.sources import from_run, read_motion_source
 
 from ..core.motion.persons import person, squat
 from ..core.motion.test_studio_files import played_by_opensim
+from . import test_scene_standing as standing
 from .conftest import SmallRun
 
 PLACE_M = 1e-4  # promised: 0.1 mm
@@ -317,6 +320,41 @@ def test_engines_get_a_root_bone_that_carries_the_path(
     hips_m = wanted.head_m[:, wanted.rig.index["hips"]]
     assert np.abs(np.array(found[hips]) - hips_m).max() < PLACE_M
     assert np.abs(np.array(found[root])[:, :2] - hips_m[:, :2]).max() < PLACE_M
+
+
+@pytest.mark.parametrize("path", ["BONE", "OBJECT"])
+@pytest.mark.parametrize(("kind", "preset", "root", "hips"), [("fbx", "unreal", "root", "pelvis"), ("glb", "unity", "Root", "Hips")])
+def test_the_root_of_our_own_body_carries_path_and_heading(
+    empty: ModuleType, tmp_path: Path, kind: str, preset: str, root: str, hips: str, path: str
+) -> None:
+    """The body turns by 200°, more than a rotation of half a turn can tell; hips move in the world as before."""
+    body = standing.walker(empty)
+    height = next(dof for dof in dofs_of(body).values() if dof["path"] == "location" and dof["bone"] == "pelvis")
+    turn = body.animation_data.action.fcurve_ensure_for_datablock(body, 'pose.bones["pelvis"].rotation_euler', index=height["index"])
+    for k, point in enumerate(turn.keyframe_points):
+        point.co.y = np.radians(200.0) * k / (standing.FRAMES - 1)
+    turn.update()
+    carry_path(empty.context.scene, Carrier(path))
+    wanted = ended(reading_played(body))
+    file = tmp_path / f"a.{kind}"
+    ended(exporting_played(body, kind, file, preset, Monitor()))
+    imported(empty, file, wanted.fps)
+    armature = next(o for o in empty.data.objects if o.type == "ARMATURE")
+    first, last = armature.animation_data.action.frame_range
+    found = []
+    for frame in np.linspace(first, last, len(wanted.frames)):
+        empty.context.scene.frame_set(int(frame + 1e-4), subframe=max(float(frame - int(frame + 1e-4)), 0.0))
+        found.append([armature.matrix_world @ armature.pose.bones[name].matrix for name in (root, hips)])
+    place_m, R = np.array(found)[..., :3, 3], np.array(found)[..., :3, :3]
+    R /= np.linalg.norm(R, axis=-2, keepdims=True)
+    since_first, hips_R = R @ transposed(R[:1]), wanted.R[:, wanted.rig.index["pelvis"]]
+    hips_m = wanted.head_m[:, wanted.rig.index["pelvis"]]
+    assert np.abs(place_m[:, 1] - hips_m).max() < PLACE_M and np.abs(place_m[:, 0, :2] - hips_m[:, :2]).max() < PLACE_M
+    assert np.ptp(place_m[:, 0, 2]) < PLACE_M and np.degrees(angle_of(transposed(since_first[:, 1]) @ hips_R @ hips_R[0].T)).max() < 0.01
+    up = np.array([0.0, 0.0, 1.0])
+    assert np.degrees(angle_of(since_first[:, 0]) - np.abs(twist_about(since_first[:, 0], up))).max() < 0.01, "a yaw only"
+    heading_deg = np.degrees(np.unwrap(twist_about(since_first[:, 0], up)))
+    assert abs(heading_deg[-1]) == pytest.approx(200.0, abs=0.05) and np.abs(np.diff(heading_deg)).max() < 25.0
 
 
 def test_opensim_and_segments_of_what_plays(empty: ModuleType, walker: Any, tmp_path: Path) -> None:

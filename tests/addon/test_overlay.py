@@ -141,6 +141,26 @@ def test_looking_closer_tells_why(run: Any, small_run: SmallRun) -> None:
     assert layers.inspect(run, "C", 3, np.array([2.0, 2.0]), 3.0) is None and layers.inspect(run, "C", 99, elbow, 3.0) is None
 
 
+def test_the_table_of_frames_has_guessed_limbs(run: Any, scene: Any, small_run: SmallRun) -> None:
+    """They are in the list of the worst frames, the graph and the markers of the scene."""
+    from tricap.core.motion.tables import read_joints
+
+    results, joints = module("overlay.results"), small_run.out / "joints.csv"
+    bad = FRAMES[2]
+    assert [reason for reason in run.doubt()[1] if reason] == ["large residuals"]
+    lines = joints.read_text().splitlines()
+    guessed = [line.replace(",seen", ",guessed") if line.split(",")[0] in ("4", "5") and ",wrist.R," in line else line for line in lines]
+    joints.write_text("\n".join(guessed))
+    assert read_joints(joints).known["wrist.R"].count("guessed") == 2
+    reasons = dict(zip(FRAMES, results.current(scene).doubt()[1]))
+    assert {frame: reason for frame, reason in reasons.items() if reason} == {
+        bad: "large residuals", 4: "right arm guessed", 5: "right arm guessed"}  # fmt: skip
+    contents, warnings = module("scene.contents"), list[str]()
+    assert contents.doubtful_in(small_run.out, warnings) == ((bad, bad, "large residuals"), (4, 5, "right arm guessed")) and not warnings
+    joints.write_text("\n".join(guessed).replace("guessed", "perhaps"))
+    assert contents.doubtful_in(small_run.out, warnings) == ((bad, bad, "large residuals"),) and "“perhaps”" in warnings[0]
+
+
 def test_the_curve_of_a_graph() -> None:
     from tricap.addon.overlay.layers import graph_curve
 

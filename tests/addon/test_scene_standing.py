@@ -153,13 +153,14 @@ def test_the_scene_is_tidy_and_a_render_shows_the_body(empty: ModuleType, out: P
     assert len(empty.data.collections) == 7, "an earlier build is replaced, with its collections"
 
 
-def walker(bpy: ModuleType) -> Any:
-    """The walking person in an empty scene, without a skin."""
+def walker(bpy: ModuleType, *, fingers: bool = False) -> Any:
+    """The walking person in an empty scene, without a skin; with the bones of fingers and toes that a skin brings."""
     from tricap.addon.scene import action, armature
     from tricap.addon.scene.standing import Standing
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     scene, shape = bpy.context.scene, default_shape(read_model("full"))
+    shape = shape_for_skin(shape, SkinSettings()) if fingers else shape
     stand = Standing(lift_m=0.96, floor_m=FLOOR_M)
     body, values = armature.add_armature(scene.collection, shape, stand), walk(shape, 0.96)
     action.add_action(body, shape, np.arange(FRAMES), shape.skeleton.dof_names, values, np.full(values.shape, 0.01), stand)

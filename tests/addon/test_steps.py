@@ -223,7 +223,10 @@ def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done:
     pull = importlib.import_module(f"{NAME}.correcting.pull_joint")
     at = pull.cameras_of(scene)["C"].project(before.joints_m["wrist.R"][1]) + (0.0, 8.0)
     assert blender.ops.tricap.pull_joint(name="wrist.R", view="C", frame=1, x=at[0], y=at[1]) == {"FINISHED"}
+    scene.timeline_markers.new("Doubtful 1: right arm guessed", frame=1)
     assert blender.ops.tricap.fit_again() == {"FINISHED"}
+    stretches = importlib.import_module(f"{NAME}.scene.contents").doubtful_in(out, [])
+    assert [(m.frame, m.name.split(": ")[1]) for m in scene.timeline_markers] == [(first, reason) for first, _, reason in stretches]
     after = read_joints(out / "joints.csv")
     shift = pull.cameras_of(scene)["C"].project(after.joints_m["wrist.R"][1]) - (at - (0.0, 8.0))
     assert shift[1] > 3.0, "towards where it was dragged, against the images"

@@ -14,7 +14,7 @@ from tricap.core.motion.formats.markers import AXES, Markers
 from tricap.core.motion.formats.opensim import component_names, write_opensim
 from tricap.core.motion.retarget.mapping import RigMap, find_map
 from tricap.core.motion.retarget.rig import Motion
-from tricap.core.motion.retarget.root_motion import root_of, with_root
+from tricap.core.motion.retarget.root_motion import heading, root_of, with_root
 
 from .persons import flail, person, squat
 
@@ -103,6 +103,42 @@ def test_the_root_bone_carries_path_and_heading() -> None:
         "relative to it the body turns as before"
     )
     assert with_root(rooted, rig_map, "root") is rooted and with_root(motion, RigMap(bones={"hips": ("hips",)}), "root") is motion
+
+
+def test_a_root_of_the_rigs_own_gets_what_it_lacks() -> None:
+    """The root of our own body travels, and gets the heading; one that stays where it is gets both; one that is animated is not touched."""
+    motion = squat(person(arms_down_deg=40.0))
+    count, rig_map = len(motion.frames), find_map(motion.rig)
+    turned = about(np.array([0.0, 0.0, 1.0]), np.linspace(0, 4 * np.pi, count))
+    path_m = np.linspace(0, 3, count)[:, None] * (1.0, -1.0, 0.0)
+    walking = replace(motion, R=turned[:, None] @ motion.R, head_m=np.einsum("tij,tbj->tbi", turned, motion.head_m) + path_m[:, None])
+    full = with_root(walking, rig_map, "root")
+    level, still = full.R.copy(), full.head_m.copy()
+    level[:, 0], still[:, 0] = full.rig.R_rest[0], full.rig.head_m[0]
+    for given in (replace(full, R=level), replace(full, R=level, head_m=still)):
+        found = with_root(given, rig_map, "root")
+        assert found.rig.names == full.rig.names
+        assert np.degrees(angle_of(transposed(found.R) @ full.R)).max() < 1e-5
+        np.testing.assert_allclose(found.head_m[..., :2], full.head_m[..., :2], atol=1e-9)
+        np.testing.assert_array_equal(found.head_m[:, 1:], full.head_m[:, 1:])
+        np.testing.assert_array_equal(found.R[:, 1:], full.R[:, 1:])
+
+
+def test_the_heading_has_no_jumps_upside_down() -> None:
+    """A somersault, and a handstand in which the hips' twist about the vertical is noise."""
+    motion = flail(person())
+    count, h, x = 90, motion.rig.index["hips"], np.array([1.0, 0.0, 0.0])
+    tilt = np.interp(np.arange(count), [10, 40, 50, 80], [0, np.pi, np.pi, 2 * np.pi])
+    noise = np.radians(2.0) * np.random.default_rng(3).normal(size=count)
+    turned = about(np.array([0.0, 0.0, 1.0]), 0.5) @ about(x, tilt) @ about(np.array([0.0, 1.0, 0.0]), noise)
+    R = np.repeat(motion.R[:1], count, axis=0)
+    R[:, h] = turned @ motion.rig.R_rest[h]
+    found = heading(
+        replace(motion, frames=np.arange(count), R=R, head_m=np.repeat(motion.head_m[:1], count, axis=0), residual=None), "hips"
+    )
+    steps = np.degrees(np.abs(np.diff(found)))
+    assert steps.max() < 25.0 and np.degrees(np.abs(found - 0.5)).max() < 45.0
+    assert found[0] == pytest.approx(0.5, abs=0.01) and found[-1] == pytest.approx(0.5, abs=0.01)
 
 
 def points_and_segments() -> tuple[Markers, Segments, Motion]:

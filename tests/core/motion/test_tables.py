@@ -10,7 +10,7 @@ from tricap.core.body.motion import BodyMotion
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.foundation.errors import InputError
-from tricap.core.motion.tables import read_joints, read_motion, write_joints, write_motion
+from tricap.core.motion.tables import read_guessed, read_joints, read_motion, write_joints, write_motion
 
 
 def _motion() -> BodyMotion:
@@ -61,6 +61,17 @@ def test_joints_come_back_by_name_and_frame(tmp_path: Path) -> None:
     assert np.allclose(table.sigma_m["elbow.R"], 0.002)
     assert np.allclose(table.frame_sigma_m["elbow.R"], 0.001)
     assert table.known["wrist.R"] == ("guessed", "guessed", "guessed", "seen")
+
+
+def test_the_frames_in_which_a_limb_is_guessed(tmp_path: Path) -> None:
+    write_joints(tmp_path / "joints.csv", _motion())
+    assert read_guessed(tmp_path / "joints.csv") == {"right arm": (3, 4, 6)}
+    text = (tmp_path / "joints.csv").read_text()
+    (tmp_path / "joints.csv").write_text("\n".join(line.rsplit(",", 2)[0] for line in text.splitlines()))
+    assert read_guessed(tmp_path / "joints.csv") == {}, "of an earlier version"
+    (tmp_path / "joints.csv").write_text(text.replace("guessed", "Guessed"))
+    with pytest.raises(InputError, match="has “Guessed” for “known”"):
+        read_guessed(tmp_path / "joints.csv")
 
 
 def test_joints_of_an_earlier_version_lack_the_later_columns(tmp_path: Path) -> None:

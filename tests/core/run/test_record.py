@@ -11,6 +11,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.run.record import (
     COLUMNS,
     FrameTable,
+    doubt,
     doubtful_frames,
     doubtful_stretches,
     frame_table,
@@ -76,7 +77,15 @@ def test_doubtful_frames() -> None:
     values["sigma_mm"] = np.array([1.0, 1.0, 4.0, 1.0, 2.0])
     states = FrameTable(frames=frames, values=values, fit=("partial", "partial", "partial", "bridged", "partial"))
     assert doubtful_frames(states, None) == {12: "points uncertain", 13: "fit bridged", 14: "points uncertain"}
-    assert doubtful_stretches(states) == [(12, 14, "points uncertain")]
+    assert doubtful_stretches(states, {}) == [(12, 14, "points uncertain")]
+    guessed = {"right arm": (10, 11, 14), "left leg": (11,)}
+    stretches = [(10, 11, "right arm guessed"), (11, 11, "left leg guessed"), (12, 14, "points uncertain"), (14, 14, "right arm guessed")]
+    assert doubtful_stretches(states, guessed) == stretches
+    assert doubtful_stretches(None, guessed) == [row for row in stretches if "guessed" in row[2]]
+    badness, why = doubt(states, guessed)
+    limbs = ("right arm guessed", "right arm and left leg guessed")
+    assert why == (*limbs, "points uncertain", "fit bridged", "right arm guessed") and badness.tolist() == [3.0, 3.0, 4.0, 3.0, 3.0]
+    assert doubt(states, {})[1][:2] == ("", ""), "what most frames share makes none of them doubtful"
     motion = SimpleNamespace(frames=frames, joint_names=("wrist.R",), known=(("guessed",), *((("seen",),) * 4)))
     body: Any = SimpleNamespace(contradicted={"upper_arm.R": (11, 12), "shin.L": (12,)}, motion=motion)
     found = doubtful_frames(states, body)
