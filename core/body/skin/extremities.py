@@ -17,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..anatomy import arrangement
 from ..metaballs import VISIBLE, Metaballs
 from ..parts import SIDES, BoneProfile, bone_profiles, chain_neighbours
 from ..shape import BodyShape
@@ -34,6 +35,7 @@ LEAST_ROOT_SQUARED = 1e-3  # … and the derivative of the root stay finite
 BOUND = 3.0  # of the parameters, in sigmas
 NECK = "neck"
 SIMPLE = 3  # balls of a bone fitted without anatomy
+SAME = 1e-6  # relative, of the sizes of an end's ellipsoids: they have one scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +122,17 @@ TABLES: dict[str, Extremity] = {
 def person_shape(shape: BodyShape) -> BodyShape:
     """The body with anatomical head, hands and feet; all other balls stay as fitted. 0.1 s for a whole body.
 
-    Bones of other names, and those refined to more than three balls, keep their balls. The upper end of the neck, which the fit widens
+    Bones of other names, and those of a user's own with another number of balls, keep them; those of the complete model have no face and no
+    fingers either. The upper end of the neck, which the fit widens
     towards the jaw, gets the width of the lower end.
     """
     counts = np.bincount(shape.metaballs.bone_index, minlength=len(shape.skeleton.bones))
     ends = {
         b: TABLES[kind]
         for b, bone in enumerate(shape.skeleton.bones)
-        if counts[b] == SIMPLE and (kind := bone.name.removesuffix(".R").removesuffix(".L")) in TABLES
+        if (kind := bone.name.removesuffix(".R").removesuffix(".L")) in TABLES
+        and counts[b] in (SIMPLE, len(arrangement(bone.name)))
+        and not has_end(shape, b)
     }
     if not ends:
         return shape
@@ -163,8 +168,14 @@ class Placement:
 
 def has_end(shape: BodyShape, b: int) -> bool:
     """Whether bone b has the ellipsoids of an anatomical head, hand or foot (`person_shape`)."""
-    name = shape.skeleton.bones[b].name.removesuffix(".R").removesuffix(".L")
-    return name in TABLES and int((shape.metaballs.bone_index == b).sum()) == len(TABLES[name].balls)
+    name, radii = (
+        shape.skeleton.bones[b].name.removesuffix(".R").removesuffix(".L"),
+        shape.metaballs.radii_m[shape.metaballs.bone_index == b],
+    )
+    if name not in TABLES or len(radii) != len(TABLES[name].balls):
+        return False
+    half = np.array([[e.half_x, e.half_y, e.half_z] for e in TABLES[name].balls])
+    return bool(np.allclose(radii / half, radii[0] / half[0], rtol=SAME, atol=0.0))  # a complete head has as many balls
 
 
 def placement(shape: BodyShape, b: int) -> Placement:

@@ -6,12 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tricap.core.body.complete import complete_shape
 from tricap.core.body.model_file import read_model
 from tricap.core.body.parts import bone_profiles, chain_neighbours
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import body_skin
-from tricap.core.body.skin.extremities import TABLES, person_shape
+from tricap.core.body.skin.extremities import TABLES, has_end, person_shape, placement
 from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.mesh import SkinSettings
 
@@ -62,6 +63,18 @@ def test_left_and_right_are_mirror_images_and_other_bones_keep_their_balls() -> 
     same = (np.isin(s.metaballs.bone_index, others) for s in (shape, person))
     a, b = (s.metaballs.radii_m[chosen] for s, chosen in zip((shape, person), same))
     np.testing.assert_array_equal(a, b)
+
+
+def test_the_complete_model_gets_head_hands_and_feet_once() -> None:
+    """Its head has as many balls as an anatomical one, which they are not."""
+    complete = complete_shape(simple())
+    person = person_shape(complete)
+    for b, bone in enumerate(complete.skeleton.bones):
+        kind = bone.name.partition(".")[0]
+        assert not has_end(complete, b) and has_end(person, b) == (kind in TABLES)
+    assert np.array_equal(person_shape(person).metaballs.radii_m, person.metaballs.radii_m)
+    head = [bone.name for bone in complete.skeleton.bones].index("head")
+    assert np.abs(np.degrees(np.arccos(placement(person, head).turn[1, 1]))) < 8.0, "the face looks ahead"
 
 
 def test_a_wider_head_stays_wider() -> None:
