@@ -136,15 +136,19 @@ def _pictures(report: Report, skin_at: SkinAt | None, monitor: Monitor, pictured
         images, sigma, frame, part = footage.read_whole(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame, near.around(cloud.xyz_m)
         high, grey = float(np.percentile(sigma, 95)) if len(sigma) else 1.0, part.image(images[ref])
         at, radius = part.pixels(cloud.xy_px[:, ref]), max(1, round(DOT * spacing * part.scale))
-        over = pictures.points_over_footage(grey, at, sigma, high, "sigma, mm", radius)
+        over = pictures.points_over_footage(grey, at, sigma, high, radius)
         caption = f"Frame {frame}, view {view}: {len(sigma):,} measured points, coloured by their sigma; red: {high:.2g} mm or more"
-        found[f"surface_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+        found[f"surface_{frame:04d}.png"] = (
+            caption,
+            pictures.with_scale(over, part.camera, cloud.xyz_m, (high, "sigma, mm") if len(sigma) else None),
+        )
         from_sides = pictures.cloud_views(cloud, camera, spacing)
         found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: the paths of the points over the last {pictures.TAIL_FRAMES} frames, coloured by speed"
-            over = pictures.tracks_over_footage(grey, part.camera, trajectories, i)
-            found[f"tracks_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+            fast = pictures.high_speed(trajectories, i)
+            over = pictures.tracks_over_footage(grey, part.camera, trajectories, i, fast)
+            found[f"tracks_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m, (fast, "speed, m/s")))
         found |= bodies.of_frame(i, images)
     return found
 

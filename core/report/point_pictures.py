@@ -8,7 +8,7 @@ from ..geometry.camera import Camera
 from ..tracking.key_points import KeyPoints
 from .drawing import size_of, small_text
 from .pictures import colour
-from .trails import both_views, limits_of
+from .trails import both_views, framed, limits_of
 
 COLOURS = ((80, 80, 240), (230, 150, 40), (90, 200, 90), (40, 190, 250), (220, 110, 200), (200, 200, 60))  # BGR, in turns
 
@@ -37,13 +37,13 @@ def paths_in_space(names: tuple[str, ...], tracked: KeyPoints, camera: Camera) -
         return None
     tints = np.array([COLOURS[n % len(COLOURS)] for n in range(tracked.status.shape[1])])
     middle, half = limits = limits_of(place[seen])
-    pair = np.hsplit(both_views(place, seen, np.broadcast_to(tints, place.shape), limits), 2)
+    pair = both_views(place, seen, np.broadcast_to(tints, place.shape), limits)
     for picture, axes, sign in zip(pair, ([0, 1], [2, 1]), (1, -1)):
         for n in np.flatnonzero(seen.any(axis=0)):
             last = place[np.flatnonzero(seen[:, n])[-1], n][axes] - middle[axes]
             x, y = np.rint(picture.shape[0] / 2 * (1 + last * [sign, 1] / half)).astype(int).tolist()
             small_text(picture, _plain(names[n]), (x + 4, y - 4), COLOURS[n % len(COLOURS)], size=1.0)
-    return np.hstack(pair)
+    return framed(pair, half)
 
 
 def _plain(name: str) -> str:

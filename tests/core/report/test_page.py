@@ -25,6 +25,7 @@ from tricap.core.report import overview
 from tricap.core.report.arrangement import arrangement, plan, words
 from tricap.core.report.close_up import alike, close_up
 from tricap.core.report.document import STYLE, document, figure, notes, table
+from tricap.core.report.drawing import GROUND, OF_PANELS, TITLE_PX
 from tricap.core.report.figures import figures_csv
 from tricap.core.report.film_strip import MOST_FRAMES, Shot, chosen_frames
 from tricap.core.report.graphs import SCRIPT, curve_graph
@@ -34,9 +35,9 @@ from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
-from tricap.core.report.trails import GROUND, KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.report.trails import KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
 from tricap.core.run.record import REASONS
-from tricap.core.tracking.reasons import REASON_COLOURS
+from tricap.core.tracking.reasons import COLOUR_WORDS, MEANINGS, REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
 from tricap.core.tracking.trajectories import with_kinematics
 
@@ -202,7 +203,9 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
     status[2:, 1], status[:, 2] = TrackStatus.TOO_FAST, TrackStatus.ABSENT
     (every, before), (removed, red), (kept, green) = trail_pictures(raw(tmp_path / "raw.npz", status), camera)
     assert "All 18 tracked" in every and "The 4 removed" in removed and "The 14 positions that were kept" in kept
-    assert before.shape == (SIDE_PX, 2 * SIDE_PX, 3)
+    assert before.shape[1] == 2 * SIDE_PX < 2 * before.shape[0]
+    top = round(TITLE_PX * OF_PANELS)
+    before, panels, green = (picture[top : top + SIDE_PX] for picture in (before, red, green))
 
     def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
         """A pixel between the ground and this colour: lines are as thin as a pixel, and smooth."""
@@ -210,7 +213,12 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
         size = np.linalg.norm(over, axis=2)
         return bool((over @ wanted > 0.99 * size * np.linalg.norm(wanted))[size > 40].any())
 
-    assert has(red, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert has(panels, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(panels, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert not has(panels, REASON_COLOURS[TrackStatus.UNCERTAIN]) and not (panels == 255).all(axis=2).any(), "no words on the trails"
+    legend = red[top + SIDE_PX :].reshape(-1, 3)
+    for colour, meaning in MEANINGS:
+        assert (legend == colour).all(axis=1).sum() > 100, f"a swatch of {meaning}"
+    assert COLOUR_WORDS in removed and {*REASON_COLOURS.values()} < {colour for colour, _ in MEANINGS}
     assert before.any() and not has(before, REASON_COLOURS[TrackStatus.TOO_FAST])
     assert trail_pictures(tmp_path / "none.npz", camera) == []
     assert trail_pictures(raw(tmp_path / "empty.npz", np.zeros((3, 2), dtype=np.int8)), camera) == []
