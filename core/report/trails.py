@@ -1,7 +1,7 @@
 """Trajectories before and after the filters, from the front and from the side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all that were
 tracked, what was removed, by reason, and what was kept."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -19,6 +19,7 @@ MOST_ARROWS = 700  # in one picture; of more, every n-th point
 ARROW = 0.12  # length of the longest arrows, by half the picture; of the few beyond them at most …
 MOST_LONG = 2.0  # … this many times as long
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
+VECTORS = {"velocity": ("velocities", "m/s"), "acceleration": ("accelerations", "m/s²")}  # and their units
 ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
 
 
@@ -57,30 +58,44 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     ]
 
 
-def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> list[tuple[str, np.ndarray]]:
+def longest_vectors(trajectories: Trajectories, index: int) -> dict[str, float]:
+    """The size of the longest arrows in one frame, by the name in `VECTORS`: nearly no point exceeds it. Without those that have none."""
+    found = dict[str, float]()
+    for name, (_, _, vectors) in _vectors(trajectories, index).items():
+        size = np.linalg.norm(vectors, axis=1)
+        size = size[np.isfinite(size)]
+        if len(size):
+            found[name] = max(float(np.percentile(size, 95)), 1e-6)
+    return found
+
+
+def vector_pictures(
+    trajectories: Trajectories, camera: Camera, index: int, longest: Mapping[str, float]
+) -> dict[str, tuple[str, np.ndarray]]:
     """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the front and from the side
-    (D'Apuzzo et al. 1999, Fig. 9); none without any."""
-    found, place = [], camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
-    for name, unit, vectors in (
-        ("velocities", "m/s", trajectories.velocity_m_s[index]),
-        ("accelerations", "m/s²", trajectories.acceleration_m_s2[index]),
-    ):
-        own = vectors.astype(np.float64) @ camera.R_cam_world.T
+    (D'Apuzzo et al. 1999, Fig. 9), by the name in `VECTORS`; of those that are in `longest`, the size of the longest and red arrows."""
+    found, place = dict[str, tuple[str, np.ndarray]](), camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
+    for key, (name, unit, vectors) in _vectors(trajectories, index).items():
+        own = vectors @ camera.R_cam_world.T
         rows = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(own).all(axis=1))
-        if not len(rows):
+        if key not in longest or not len(rows):
             continue
-        every = max(1, -(-len(rows) // MOST_ARROWS))
+        every, high = max(1, -(-len(rows) // MOST_ARROWS)), longest[key]
         rows = rows[::every]
-        size = np.linalg.norm(own[rows], axis=1)
-        longest = max(float(np.percentile(size, 95)), 1e-6)
-        limits = limits_of(place[rows])
-        arrows = own[rows] * (ARROW * limits[1] / longest * np.minimum(1.0, MOST_LONG * longest / np.maximum(size, 1e-12)))[:, None]
-        pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
-        bar = longest, f"{name}, {unit.replace('²', '^2')}"
+        size, limits = np.linalg.norm(own[rows], axis=1), limits_of(place[rows])
+        arrows = own[rows] * (ARROW * limits[1] / high * np.minimum(1.0, MOST_LONG * high / np.maximum(size, 1e-12)))[:, None]
+        pair = [_arrows(place[rows], arrows, size / high, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
         words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
-        found.append((f"{words}; red and longest: {longest:.2g} {unit} or more", framed(pair, limits[1], bar, 1.0)))
+        shown = framed(pair, limits[1], (high, f"{name}, {unit.replace('²', '^2')}"), 1.0)
+        found[key] = (f"{words}; red and longest: {high:.2g} {unit} or more", shown)
     return found
+
+
+def _vectors(trajectories: Trajectories, index: int) -> dict[str, tuple[str, str, np.ndarray]]:
+    """Name, unit and vectors (N, 3) in one frame."""
+    both = trajectories.velocity_m_s, trajectories.acceleration_m_s2
+    return {key: (*words, vectors[index].astype(np.float64)) for (key, words), vectors in zip(VECTORS.items(), both)}
 
 
 def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tuple[np.ndarray, float], axes: str) -> np.ndarray:

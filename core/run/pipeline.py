@@ -159,6 +159,7 @@ def report(run: Run, monitor: Monitor) -> None:
         silhouettes=run.silhouettes,
         doubtful=doubtful_frames(frame_table(run.measured.summaries, run.trajectories, run.body), run.body),
         close_ups=run.close_ups,
+        colour_limits=run.colour_limits,
     )
     write_report(run.results, shown, monitor, run.pictured)
     run.finish_stage("report", began)

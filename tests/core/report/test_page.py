@@ -35,7 +35,7 @@ from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
-from tricap.core.report.trails import KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.report.trails import KEPT_COLOUR, SIDE_PX, longest_vectors, trail_pictures, vector_pictures
 from tricap.core.run.record import REASONS
 from tricap.core.tracking.reasons import COLOUR_WORDS, MEANINGS, REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
@@ -236,14 +236,18 @@ def test_vectors_point_where_the_points_go(scenes: Any) -> None:
         + 0.5 * t**2 * 0.01 * right
     )
     tracks = with_kinematics(np.arange(5), np.arange(5) / 10, xyz, np.full((5, 3), 1e-3), np.ones((5, 3), dtype=np.int8), 0)
-    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2)
+    longest = longest_vectors(tracks, 2)
+    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2, longest).values()
     assert "velocities of 3 tracked points" in speed and "longest: 0.2 m/s" in speed and "longest: 1 m/s²" in bend
     front, side = np.split(front_and_side, 2, axis=1)
     red = [(p[..., 2].astype(int) - p[..., 0] > 60) & (p[..., 1] < 120) for p in (front, side)]
     columns = [len(np.unique(np.nonzero(r)[1])) for r in red]
     assert columns[0] > 15 and columns[0] > 2 * columns[1]
     empty = with_kinematics(np.arange(1), np.arange(1) / 10, xyz[:1], np.full((1, 3), 1e-3), np.ones((1, 3), dtype=np.int8), 0)
-    assert vector_pictures(empty, camera, 0) == [], "a single frame has no velocities"
+    assert longest_vectors(empty, 0) == {} == vector_pictures(empty, camera, 0, longest), "a single frame has no velocities"
+    (slow, paler), _ = vector_pictures(tracks, camera, 2, longest | {"velocity": 0.8}).values()
+    hue = np.split(paler, 2, axis=1)[0][round(TITLE_PX) :][:SIDE_PX]
+    assert "longest: 0.8 m/s" in slow and not ((hue[..., 2].astype(int) - hue[..., 0] > 60) & (hue[..., 1] < 120)).any()
 
 
 def page(tmp_path: Path) -> Path:
