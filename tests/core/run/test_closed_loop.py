@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.run import pipeline
+from tricap.core.run import closed_loop, pipeline
 from tricap.core.run.closed_loop import OFF, OUTLINES, TRACKS, loop_of
 from tricap.core.run.settings import settings_of
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
@@ -15,10 +15,13 @@ from tricap.core.synthetic.truth import read_truth
 from tricap.core.tracking.contour import ContourTable
 
 
-def test_the_loop_is_closed_where_it_is_asked_for() -> None:
+def test_the_loop_is_closed_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By default it is open; auto may close it for whole bodies only."""
     whole, arm = (read_model(name).skeleton for name in ("full", "arm.R"))
     assert [loop_of(FitSettings(closed_loop=word), arm) for word in (OFF, TRACKS, OUTLINES)] == [OFF, TRACKS, OUTLINES]
-    assert loop_of(FitSettings(), arm) == OFF and loop_of(FitSettings(), whole) in (OFF, TRACKS, OUTLINES)
+    assert loop_of(FitSettings(), arm) == OFF == loop_of(FitSettings(), whole)
+    monkeypatch.setattr(closed_loop, "FOR_WHOLE_BODIES", TRACKS)
+    assert loop_of(FitSettings(), arm) == OFF and loop_of(FitSettings(), whole) == TRACKS
     assert settings_of({}, {"method": {"preset": "published"}}, "take.toml")["fitting"].closed_loop == OFF
 
 
