@@ -34,16 +34,19 @@ from .film_strip import CELL_PX, Shot, chosen_frames
 from .graphs import curve_graph
 from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
+from .loop_pictures import loop_words, outline_pictures
 from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
 from .person import SkinAt, coloured_skin, skin_in
 from .silhouettes import Silhouettes
 from .trails import VECTORS, longest_vectors, trail_pictures, vector_pictures
 
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
+LOOP = "The closed loop"
 KINDS = {  # of pictures
     "Measured surface": ("surface", "cloud"),
     "Trajectories": ("tracks", "vectors", "trails"),
     "Body over the footage": ("body",),
+    LOOP: ("outlines",),
     "Layers of the body": ("layers",),
 }
 BROAD = ("vectors",)  # two pictures of two panels
@@ -106,6 +109,8 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
         longest = {name: limits[f"vectors_{name}.png"] for name in VECTORS if f"vectors_{name}.png" in limits}
         vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2, longest)
         shown |= {f"vectors_{name}.png": picture for name, picture in vectors.items()}
+    if loop_words(record["stages"]):
+        shown |= outline_pictures(results, report.footage, report.trajectories, report.close_ups)
     shown |= _layers(report, results.path("skin"), skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
@@ -287,7 +292,11 @@ def limb_of(dof: str) -> str:
 def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], shots: Sequence[Shot]) -> str:
     """The whole page. Names of the take, its views and its files are text, wherever they come from."""
     record, take = report.record, report.record["take"].rsplit("/", 1)[-1]
-    sections = [*_picture_sections(files), ("Over time", _over_time(report)), ("All figures", _all_figures(record, rows))]
+    sections = [
+        *_picture_sections(files, loop_words(record["stages"])),
+        ("Over time", _over_time(report)),
+        ("All figures", _all_figures(record, rows)),
+    ]
     if recorded := _recording(report):
         sections.insert(0, ("Cameras and person", recorded))
     links = " · ".join(f'<a href="#part{n}">{title}</a>' for n, (title, _) in enumerate(sections))
@@ -331,14 +340,19 @@ def _recording(report: Report) -> str:
     return f'<div class="first">{plan(shown)}<p>{html.escape(words(shown))}</p></div>' if shown else ""
 
 
-def _picture_sections(files: Mapping[str, tuple[str, bytes]]) -> list[tuple[str, str]]:
-    """Titles and pictures of the papers' figures."""
+def _picture_sections(files: Mapping[str, tuple[str, bytes]], loop: str) -> list[tuple[str, str]]:
+    """Titles and pictures of the papers' figures; that of the closed loop begins with the words about it."""
     found = {
         kind: [figure(*files[name]) for name in files if name.startswith((f"{kind}_", f"{kind}."))] for kind in sum(KINDS.values(), ())
     }
-    sections = [(title, "".join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])) for title, kinds in KINDS.items()]
-    axes = {title: REST_AXES if "layers" in kinds else AXES for title, kinds in KINDS.items()}
-    return [(title, f'{content}<p class="soft">{axes[title]}</p>') for title, content in sections if content]
+    sections = list[tuple[str, str]]()
+    for title, kinds in KINDS.items():
+        content = "".join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])
+        axes = f'<p class="soft">{REST_AXES if "layers" in kinds else AXES}</p>' if content else ""
+        said = f"<p>{html.escape(loop)}</p>" if title == LOOP and loop else ""
+        if content or said:
+            sections.append((title, f"{said}{content}{axes}"))
+    return sections
 
 
 def _over_time(report: Report) -> str:

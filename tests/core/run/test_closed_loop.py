@@ -43,6 +43,11 @@ def test_a_run_through_the_loop(tmp_path: Path) -> None:
         sleeve = sleeve[np.linalg.norm(sleeve - camera.project(elbow[0]), axis=1) < 15]
         apart = np.linalg.norm(table[0].xy_px[:, None] - sleeve, axis=2).min(axis=1)
         assert apart.min() < 3.0
+    assert first.record["stages"]["fit"]["closed_loop"] == OUTLINES
+    shown = {path.name for path in (out / "report").glob("outlines_*.png")}
+    assert shown == {f"outlines_0002_{camera.name}.png" for camera in rig.cameras}
+    page = (out / "report" / "report.html").read_text()
+    assert ">The closed loop</h2>" in page and f"closed once (fitting.closed_loop = {OUTLINES})" in page
     kept = (out / "joints.csv").read_bytes()
     (out / "joints.csv").unlink()
     pipeline.run(tmp_path / "take", out, settings)
