@@ -80,6 +80,11 @@ def with_legend(picture: np.ndarray, meanings: Sequence[tuple[tuple[int, int, in
     return np.vstack([picture, *rows])
 
 
+def plain(words: str) -> str:
+    """Words in OpenCV's letters, which are ASCII."""
+    return words.encode("ascii", "replace").decode()
+
+
 def text_width(words: str, size: float) -> int:
     """The width [px] of words of `small_text`."""
     return int(cv2.getTextSize(words, FONT, 0.42 * size, max(1, round(size)))[0][0])

@@ -11,7 +11,7 @@ import pytest
 from tricap.core.report import pictures
 from tricap.core.report.drawing import GROUND, OF_PANELS, ROOM_PX, ROW_PX, TITLE_PX, with_legend
 from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned, ticks
-from tricap.core.report.point_pictures import paths_in_space
+from tricap.core.report.point_pictures import COLOURS, paths_in_space, paths_over_footage
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 
@@ -132,6 +132,15 @@ def test_png_and_grey() -> None:
 def test_the_scale_has_round_values(low: float, high: float, labels: list[str]) -> None:
     found = ticks(low, high)
     assert [text for _, text in found] == labels and all(low <= value <= high for value, _ in found)
+
+
+def test_chosen_points_are_joined_and_have_names_within_the_image() -> None:
+    """A name at the right edge is written to the left; a line with an end that is not there is left out."""
+    xy = np.array([[[20.0, 60.0], [190.0, 60.0], [np.nan, np.nan]]])
+    plain, joined, gone = (paths_over_footage(GREY, ("a", "rightmost", "b"), xy, 0, j) for j in ((), (("a", "rightmost"),), (("a", "b"),)))
+    assert np.array_equal(plain, gone) and (joined != plain).any(axis=2)[58:63, 40:100].any(axis=0).all()
+    name = (np.abs(plain.astype(int) - COLOURS[1]).max(axis=2) < 60)[40:56]
+    assert name[:, :184].sum() > 30 and not name[:, 192:].any()
 
 
 def test_paths_of_chosen_points_have_names(scenes: Any) -> None:
