@@ -6,7 +6,7 @@ what a method reports about itself, except for times and sigmas. The colours of 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -61,16 +61,24 @@ def run_both(
         return open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart, clicked=clicked)
 
     with ExitStack() as both:
+        both.callback(_remove_empty, out / PUBLISHED)
         default = both.enter_context(opened(DEFAULT))
         _complete(default, DEFAULT, monitor)
         clicked, note = _found_joints(default)
         try:
             published = both.enter_context(opened(PUBLISHED, clicked))
+            published.pictured = _pictured(out / DEFAULT)
             _complete(published, PUBLISHED, monitor)
         except InputError as error:
             return Halves(folders={DEFAULT: out / DEFAULT}, notes=(*note, f"The published method could not run: {error}"))
         _alike((published, default), monitor)
     return Halves(folders={method: out / method for method in METHODS}, notes=note)
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder unless something is in it."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _complete(run: Run, method: str, monitor: Monitor) -> None:
@@ -79,6 +87,11 @@ def _complete(run: Run, method: str, monitor: Monitor) -> None:
     if not pipeline.is_complete(run):
         monitor.begin(method)
         pipeline.all_stages(run, monitor)
+
+
+def _pictured(folder: Path) -> list[int]:
+    """The frames of the pictures in a report: those of both reports are beside each other."""
+    return sorted(int(path.stem.rpartition("_")[2]) for path in (folder / "report").glob("cloud_*.png"))
 
 
 def _found_joints(run: Run) -> tuple[Callable[[Take], Take] | None, tuple[str, ...]]:
@@ -140,7 +153,7 @@ def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
         (TRACKS, "length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
         (TRACKS, "trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
         (BODY, "reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
-        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
+        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(v.get("seconds", 0.0) for v in s.values()) if s else None),
     )
     values = [[float(v) if (v := of(run["stages"])) is not None else float("nan") for run in runs] for *_, of in wanted]
     return [Measure(group=g, name=n, unit=u, published=a, default=b, better=c) for (g, n, u, c, _), (a, b) in zip(wanted, values)]

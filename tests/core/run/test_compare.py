@@ -83,12 +83,15 @@ def test_found_joints_are_clicks_of_the_published_method(
     plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The default runs first, and the published method begins from what it found; both reports get the larger end of each scale."""
+    pictured = dict[str, list[int]]()
     ran, drawn, ends = list[tuple[str, dict[str, float], int]](), list[tuple[str, dict[str, float]]](), {DEFAULT: 4.3, PUBLISHED: 6.0}
 
     def stages(run: Run, monitor: Monitor) -> None:
         method, take = run.settings["method"].preset, run.footage.take
         at = {name: float(xy["C"][0]) for name, xy in take.clicks.joints.items()}
         ran.append((method, at, take.clicks.frame))
+        pictured[method] = [*run.pictured]
+        store.write_bytes(run.results.path("report", "cloud_0001.png"), b"")
         start = {"frame": 1, "unsure": ["wrist.L"], "joints_m": {"neck": [0.0, 0.1, scenes.depth_m], "wrist.L": [0.1, 0.1, 2.0]}}
         run.record["stages"]["fit"] = {"start": start} if method == DEFAULT else {}
         run.surfaceless = True
@@ -100,6 +103,7 @@ def test_found_joints_are_clicks_of_the_published_method(
     halves = run_both(plane_take, tmp_path / "out", {}, (0, 2), Monitor())
     neck = scenes.three_cameras()["C"].project(np.array([0.0, 0.1, scenes.depth_m]))[0]
     assert ran == [(DEFAULT, {}, 0), (PUBLISHED, {"neck": pytest.approx(neck, abs=0.06)}, 1)]
+    assert pictured == {DEFAULT: [], PUBLISHED: [1]}, "the same frames are shown"
     assert drawn == [(DEFAULT, {"surface_0000.png": 6.0, "tracks_0000.png": 1.5})], "of the other the scale is the common one"
     assert list(halves.folders) == list(METHODS) and "it began from 1 joints" in halves.notes[0] and "in frame 1" in halves.notes[0]
 
@@ -132,6 +136,7 @@ def test_where_the_published_method_cannot_run(plane_take: Path, tmp_path: Path,
     rows = {row["name"]: row for row in table["measures"]}
     assert rows["points a frame"]["default"] > 100 and rows["points a frame"]["published"] is None
     assert rows["noise of a point about the surface through its neighbours"]["default"] > 0
+    assert rows["duration of all stages"]["published"] is None and not (out / PUBLISHED).exists()
 
 
 @pytest.mark.slow
