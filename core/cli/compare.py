@@ -12,7 +12,7 @@ import numpy as np
 
 from ..foundation.progress import Monitor
 from ..foundation.store import without_nan
-from ..report.comparison import HIGHER, LOWER, Measure
+from ..report.comparison import DEFAULT, HIGHER, LOWER, PUBLISHED, Measure
 from ..run.compare import as_lines, as_row, measures_of, run_both, write_comparison
 from ..synthetic.score import Score, score_run
 from .arguments import frame_range, overrides
@@ -23,17 +23,18 @@ TRUTH = "Against the truth"  # group of measures
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Compare; the table's lines. Raises as `run_both`."""
     take: Path = args.take
-    folders = run_both(take, args.out, overrides(args.set), frame_range(args.frames), monitor, restart=args.restart)
-    measures = measures_of(folders, monitor)
+    halves = run_both(take, args.out, overrides(args.set), frame_range(args.frames), monitor, restart=args.restart)
+    measures = measures_of(halves, monitor)
     if (take / "truth.npz").is_file():
-        measures = [*_of_truth(*(score_run(take, folder, monitor) for folder in folders)), *measures]
-    write_comparison(args.out, take, folders, measures)
+        scores = {method: score_run(take, folder, monitor) for method, folder in halves.folders.items()}
+        measures = [*_of_truth(scores.get(PUBLISHED), scores[DEFAULT]), *measures]
+    write_comparison(args.out, take, halves, measures)
     if args.json:
         return [json.dumps(without_nan([as_row(m) for m in measures]), indent=1, ensure_ascii=False)]
-    return [*as_lines(measures), f"Page: {args.out / 'compare.html'}"]
+    return [*as_lines(measures), *halves.notes, f"Page: {args.out / 'compare.html'}"]
 
 
-def _of_truth(published: Score, default: Score) -> list[Measure]:
+def _of_truth(published: Score | None, default: Score) -> list[Measure]:
     """The measures against the truth."""
     wanted = (
         ("coverage of the true surface", "%", HIGHER, lambda s: 100 * s.clouds.coverage),
@@ -48,10 +49,10 @@ def _of_truth(published: Score, default: Score) -> list[Measure]:
         ("error of the skin (median)", "mm", LOWER, lambda s: s.skin.median_mm),
     )
 
-    def value(score: Score, of: Any) -> float:
+    def value(score: Score | None, of: Any) -> float:
         try:
             return float(of(score))
-        except AttributeError:  # a part of the score is None: the run lacks that result
+        except AttributeError:  # the score or a part of it is None: there is no such run, or it lacks that result
             return float("nan")
 
     return [

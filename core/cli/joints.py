@@ -21,7 +21,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.model is not None:
         return _by_network(args, monitor)
     footage, start, settings = joints_of_take(args.take, overrides(args.set), monitor)
-    joints, limit = pixels_of(footage, start), settings["fitting"].least_start_probability
+    joints, limit = pixels_of(footage, start.xyz_m, start.unsure), settings["fitting"].least_start_probability
     certain = start.probability >= limit
     if args.write and not certain:
         raise InputError(f"Nothing was written. {start.question}")

@@ -218,7 +218,7 @@ def _track2d(commands: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
     parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
     parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to use")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the named points, joined with lines, over the images")
     _set_argument(parser)
 
 

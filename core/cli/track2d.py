@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..foundation import store
@@ -13,6 +12,8 @@ from ..foundation.settings import from_table
 from ..images.interlace import row_grid
 from ..images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
 from ..matching.least_squares import MatchingSettings
+from ..report.pictures import png
+from ..report.point_pictures import paths_over_footage
 from ..run.settings import Overrides
 from ..tracking.planar import PlanarTracks, track_planar
 from ..tracking.point_tables import ChosenPoints, read_points, write_planar
@@ -105,16 +106,8 @@ def _check_inside(points: ChosenPoints, image: np.ndarray, path: Path) -> None:
 
 
 def _draw(folder: Path, sequence: ImageSequence, points: ChosenPoints, tracks: PlanarTracks, monitor: Monitor) -> None:
-    index = {name: n for n, name in enumerate(points.names)}
-    for t, frame in enumerate(tracks.frames):
+    """Write a picture per frame: the points with their names and paths, joined by lines."""
+    for t, frame in enumerate(tracks.frames.tolist()):
         monitor.step("pictures", t, len(tracks.frames))
-        picture = cv2.cvtColor(np.clip(sequence.read(int(frame)), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-        at = [None if np.isnan(xy).any() else (round(float(xy[0])), round(float(xy[1]))) for xy in tracks.xy_px[t]]
-        for name, other in points.joined:
-            a, b = at[index[name]], at[index[other]]
-            if a is not None and b is not None:
-                cv2.line(picture, a, b, (255, 200, 0), 1, cv2.LINE_AA)
-        for place in at:
-            if place is not None:
-                cv2.circle(picture, place, 3, (0, 0, 255), 1, cv2.LINE_AA)
-        store.write_bytes(folder / f"{frame:04d}.png", cv2.imencode(".png", picture)[1].tobytes())
+        picture = paths_over_footage(sequence.read(frame), points.names, tracks.xy_px, t, points.joined)
+        store.write_bytes(folder / f"{frame:04d}.png", png(picture))

@@ -35,7 +35,7 @@ class BodyPictures:
             person = self._silhouettes.outlines.get(name, {}).get(frame)
             outline = None if person is None else part.pixels(person)
             picture = pictures.body_over_footage(part.image(image), part.camera, body.shape, body.motion.values[index], skin, outline)
-            pictures.with_scale(picture, part.camera, body.motion.joints_m[index])
+            picture = pictures.with_scale(picture, part.camera, body.motion.joints_m[index])
             caption = f"Frame {frame}, view {name}: the fitted body{agreement_words(self._silhouettes, name, frame)}"
             found[f"body_{frame:04d}_{name}.png"] = (caption, picture)
         return found

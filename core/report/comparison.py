@@ -1,7 +1,7 @@
 """The page of `tricap compare`: the published and the default method on one take, the same measures and pictures side by side."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..images.sequence import decoded
 from . import pictures
-from .document import SCRIPT, document, figure, table
+from .document import SCRIPT, document, figure, notes, table
 
 PUBLISHED, DEFAULT = "published", "default"  # the methods, by the names of their presets
 METHODS = (PUBLISHED, DEFAULT)
@@ -48,18 +48,24 @@ class Measure:
         return PUBLISHED if (a > b) == (self.better == HIGHER) else DEFAULT
 
 
-def comparison_page(take: str, measures: Sequence[Measure], folders: Sequence[Path]) -> str:
-    """The page of a take (its name), with pictures from the reports in the two result folders, in the order of `METHODS`."""
-    wins = {method: [m.name for m in measures if m.winner == method] for method in METHODS}
-    judged = sum(bool(m.better) for m in measures)
+def comparison_page(take: str, measures: Sequence[Measure], folders: Mapping[str, Path], remarks: Sequence[str] = ()) -> str:
+    """The page of a take (its name), with remarks and the pictures from the reports in the result folders of the methods that ran."""
     body = (
         f"<h1>{html.escape(take)}: published and default method</h1>"
-        f'<p class="verdict">Of {judged} measures, the default is better in {len(wins[DEFAULT])} and the published method in '
-        f"{len(wins[PUBLISHED])}{_named(wins[PUBLISHED])}; in the others they differ by less than 2 %, or one has no value.</p>"
+        f'<p class="verdict">{_verdict(measures) if len(folders) == len(METHODS) else "Only the default method ran."}</p>{notes(remarks)}'
         '<p class="soft">Published: as D\'Apuzzo et al. 1999 and 2000 describe it, from clicked points. Default: Tricap as it is.</p>'
         f"{_table(measures)}<h2>Pictures</h2>{''.join(_picture_rows(folders))}"
     )
     return document(f"Tricap: {take}, published and default", body, SCRIPT)
+
+
+def _verdict(measures: Sequence[Measure]) -> str:
+    """In how many measures each of the methods is better."""
+    wins = {method: [m.name for m in measures if m.winner == method] for method in METHODS}
+    return (
+        f"Of {sum(bool(m.better) for m in measures)} measures, the default is better in {len(wins[DEFAULT])} and the published method in "
+        f"{len(wins[PUBLISHED])}{_named(wins[PUBLISHED])}; in the others they differ by less than 2 %, or one has no value."
+    )
 
 
 def _table(measures: Sequence[Measure]) -> str:
@@ -93,14 +99,15 @@ def written(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".") if value else "0"
 
 
-def _picture_rows(folders: Sequence[Path]) -> list[str]:
-    """The pictures of the same name in both reports, a row each."""
-    found = [{path.name: path for path in sorted((folder / "report").glob("*.png"))} for folder in folders]
+def _picture_rows(folders: Mapping[str, Path]) -> list[str]:
+    """The pictures of the same name in all reports, a row each."""
+    found = {method: {path.name: path for path in sorted((folder / "report").glob("*.png"))} for method, folder in folders.items()}
+    shared = [name for name in found[DEFAULT] if all(name in files for files in found.values())]
     rows = []
     for kind in KINDS:
-        for name in (name for name in found[0] if name.startswith((f"{kind}_", f"{kind}.")) and name in found[1]):
+        for name in (name for name in shared if name.startswith((f"{kind}_", f"{kind}."))):
             caption = _caption(kind, name.removesuffix(".png").removeprefix(kind).removeprefix("_"))
-            pair = [figure(f"{method}: {caption}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)]
+            pair = [figure(f"{method}: {caption}", pictures.jpeg(decoded(files[name]))) for method, files in found.items()]
             rows.append(f'<div class="row broad">{"".join(pair)}</div>')
     return rows
 

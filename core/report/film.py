@@ -22,14 +22,17 @@ from ..motion.tables import JointTable, read_joints
 from ..results.folder import Results
 from ..take.footage import Footage
 from .close_up import Detail, alike, close_up
-from .overview import about_joints, sigma_colours
+from .drawing import plain, size_of, small_text, text_width
+from .overview import SIGMAS_MM, about_joints, sigma_colours
 from .pictures import OPACITY, SKIN_COLOUR, colour
 
 WIDTH_PX, HEIGHT_PX = 1920, 1080  # of the movie, at most
 LARGEST = 2.0  # a pixel of the footage, in pixels of the movie
 MOST_PLACES = 300  # of each joint, that show where the person is
 CODEC = "mp4v"
-BAR_PX = 26  # height of the line of text
+BAR_PX = 36  # height of the line of text
+LETTERS = 1.6  # largest size of those in it
+LEGEND_PX, ROOM_PX = 90, 470  # of the colours in that line, and of all that is in it, by the size of letters
 
 
 def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
@@ -59,7 +62,7 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
             places = {name: (xyz[t], _sigma(joints, name)[t]) for name, xyz in joints.joints_m.items()}
             images = [detail.image(grey) for detail, grey in zip(details, footage.read_whole(frame))]
             panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(images, cameras)]
-            movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s   views {', '.join(c.name for c in cameras)}"))
+            movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s"))
         movie.release()
         if cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT) != len(joints.frames):  # the writer does not report a full disk
             raise InputError(f"The movie {part} could not be written whole; check that the disk has room.")
@@ -110,16 +113,33 @@ def _panel(
             cv2.line(drawn, spots[head], spots[tail], (255, 255, 255), 1, cv2.LINE_AA)
     for name, spot in spots.items():
         cv2.circle(drawn, spot, 3, tint[name], -1, cv2.LINE_AA)
+    k = size_of(drawn)
+    small_text(drawn, f"view {plain(camera.name)}", (8, 8 + round(14 * k)), size=k)
     return drawn
 
 
 def _together(panels: list[np.ndarray], size: tuple[int, int], text: str) -> np.ndarray:
-    """The views side by side above a line of text; width and height are even, as movies need."""
+    """The views side by side above a line of text and the colours of the joints; width and height are even, as movies need."""
     picture = np.zeros((size[1], size[0], 3), np.uint8)
     x = 0
     for panel in panels:
         picture[: panel.shape[0], x : x + panel.shape[1]] = panel
         x += panel.shape[1]
-    plain = text.encode("ascii", "replace").decode()  # OpenCV's letters are ASCII
-    cv2.putText(picture, plain, (8, size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    k = min(LETTERS, size[0] / ROOM_PX)
+    base = size[1] - round(BAR_PX / 2 - 4.5 * k)
+    small_text(picture, text, (8, base), size=k)
+    _add_legend(picture, base, k)
     return picture[: size[1] // 2 * 2, : size[0] // 2 * 2]
+
+
+def _add_legend(picture: np.ndarray, base: int, k: float) -> None:
+    """The colours of the joints' sigmas, on a base line at the right."""
+    ends = [f"{SIGMAS_MM[0]:g} mm", f"{SIGMAS_MM[-1]:g} mm"]
+    right, gap, length = picture.shape[1] - 8, round(6 * k), round(LEGEND_PX * k)
+    colours = sigma_colours(np.geomspace(SIGMAS_MM[0], SIGMAS_MM[-1], length))
+    at = right - text_width(ends[1], k)
+    small_text(picture, ends[1], (at, base), size=k)
+    start = at - gap - length
+    picture[base - round(9 * k) : base, start : start + length] = colours.astype(np.uint8)
+    words = f"sigma of a joint: {ends[0]}"
+    small_text(picture, words, (start - gap - text_width(words, k), base), size=k)

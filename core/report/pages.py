@@ -34,16 +34,19 @@ from .film_strip import CELL_PX, Shot, chosen_frames
 from .graphs import curve_graph
 from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
+from .loop_pictures import loop_words, outline_pictures
 from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
 from .person import SkinAt, coloured_skin, skin_in
 from .silhouettes import Silhouettes
-from .trails import trail_pictures, vector_pictures
+from .trails import VECTORS, longest_vectors, trail_pictures, vector_pictures
 
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
+LOOP = "The closed loop"
 KINDS = {  # of pictures
     "Measured surface": ("surface", "cloud"),
     "Trajectories": ("tracks", "vectors", "trails"),
     "Body over the footage": ("body",),
+    LOOP: ("outlines",),
     "Layers of the body": ("layers",),
 }
 BROAD = ("vectors",)  # two pictures of two panels
@@ -84,6 +87,7 @@ class Report:
     silhouettes: Silhouettes
     doubtful: Mapping[int, str] = field(default_factory=dict)  # frame -> why, the worst first
     close_ups: bool = True  # pictures show the person as large as they can; otherwise whole images, for pages beside each other
+    colour_limits: Mapping[str, float] = field(default_factory=dict)  # upper ends of bars of colours, by picture; the others are its own
 
 
 def write_report(results: Results, report: Report, monitor: Monitor, pictured: Sequence[int] = ()) -> None:
@@ -94,13 +98,19 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     record, fits = report.record, report.silhouettes.fits
     trails = trail_pictures(results.path("trajectories_raw.npz"), report.footage.rig.cameras[report.footage.take.reference])
     skin_at = skin_in(results.path("skin"), report.body, SkinSettings(**record["settings"]["skin"]))
-    shown = _pictures(report, skin_at, monitor, pictured) | {
+    chosen = [report.footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
+    limits = _colour_limits(report, chosen)
+    limits |= {name: high for name, high in report.colour_limits.items() if name in limits}
+    shown = _pictures(report, skin_at, monitor, chosen, limits) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
     if report.trajectories is not None:
         tracks, camera = report.trajectories, report.footage.rig.cameras[report.footage.take.reference]
-        vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2)
-        shown |= {f"vectors_{name}.png": picture for name, picture in zip(("velocity", "acceleration"), vectors)}
+        longest = {name: limits[f"vectors_{name}.png"] for name in VECTORS if f"vectors_{name}.png" in limits}
+        vectors = vector_pictures(tracks, camera, len(tracks.frames) // 2, longest)
+        shown |= {f"vectors_{name}.png": picture for name, picture in vectors.items()}
+    if loop_words(record["stages"]):
+        shown |= outline_pictures(results, report.footage, report.trajectories, report.close_ups)
     shown |= _layers(report, results.path("skin"), skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
@@ -114,37 +124,58 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
     per_frame = [asdict(f) | {key: number(getattr(f, key)) for key in ("iou", "inside", "distance_px")} for f in fits]
-    numbers = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
+    numbers = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame, "colour_limits": limits}
     store.write_json(results.path("report", "report.json"), numbers)
     store.write_text(results.path("report", "figures.csv"), figures_csv(rows))
     store.write_text(results.path("report", "report.html"), page)
 
 
-def _pictures(report: Report, skin_at: SkinAt | None, monitor: Monitor, pictured: Sequence[int]) -> dict[str, tuple[str, np.ndarray]]:
-    """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
+def _colour_limits(report: Report, chosen: Sequence[int]) -> dict[str, float]:
+    """The upper end of the bar of colours of every picture that has one; of the frames `chosen` (indices)."""
+    limits, frames, tracks = dict[str, float](), report.footage.frames, report.trajectories
+    for i in chosen:
+        sigma = report.clouds[i].sigma_m
+        if len(sigma):
+            limits[f"surface_{frames[i]:04d}.png"] = 1e3 * float(np.percentile(sigma, 95))
+        if tracks is not None and np.isfinite(fast := pictures.high_speed(tracks, i)):
+            limits[f"tracks_{frames[i]:04d}.png"] = fast
+    if tracks is not None:
+        limits |= {f"vectors_{name}.png": high for name, high in longest_vectors(tracks, len(tracks.frames) // 2).items()}
+    return limits
+
+
+def _pictures(
+    report: Report, skin_at: SkinAt | None, monitor: Monitor, chosen: Sequence[int], limits: Mapping[str, float]
+) -> dict[str, tuple[str, np.ndarray]]:
+    """File name → (caption, picture), for the frames `chosen` (indices). `limits`: upper ends of the bars of colours."""
     footage, clouds, trajectories = report.footage, report.clouds, report.trajectories
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
     spacing = report.record["settings"]["growing"]["spacing_px"]
     found: dict[str, tuple[str, np.ndarray]] = {}
-    chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or _first_middle_last(report)
     near = close_up(camera, [clouds[i].xyz_m for i in chosen] if report.close_ups else [])
     bodies = BodyPictures(report.body, report.silhouettes, skin_at, footage.rig, chosen, near=report.close_ups)
     for n, i in enumerate(chosen):
         monitor.step("report", n, 2 * len(chosen))
         cloud = clouds[i]
         images, sigma, frame, part = footage.read_whole(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame, near.around(cloud.xyz_m)
-        high, grey = float(np.percentile(sigma, 95)) if len(sigma) else 1.0, part.image(images[ref])
+        name, grey = f"surface_{frame:04d}.png", part.image(images[ref])
+        high = limits.get(name, float("nan"))
         at, radius = part.pixels(cloud.xy_px[:, ref]), max(1, round(DOT * spacing * part.scale))
-        over = pictures.points_over_footage(grey, at, sigma, high, "sigma, mm", radius)
+        over = pictures.points_over_footage(grey, at, sigma, high, radius)
         caption = f"Frame {frame}, view {view}: {len(sigma):,} measured points, coloured by their sigma; red: {high:.2g} mm or more"
-        found[f"surface_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+        found[f"surface_{frame:04d}.png"] = (
+            caption,
+            pictures.with_scale(over, part.camera, cloud.xyz_m, (high, "sigma, mm") if len(sigma) else None),
+        )
         from_sides = pictures.cloud_views(cloud, camera, spacing)
         found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: the paths of the points over the last {pictures.TAIL_FRAMES} frames, coloured by speed"
-            over = pictures.tracks_over_footage(grey, part.camera, trajectories, i)
-            found[f"tracks_{frame:04d}.png"] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m))
+            name = f"tracks_{frame:04d}.png"
+            fast = limits.get(name, float("nan"))
+            over = pictures.tracks_over_footage(grey, part.camera, trajectories, i, fast)
+            found[name] = (caption, pictures.with_scale(over, part.camera, cloud.xyz_m, (fast, "speed, m/s")))
         found |= bodies.of_frame(i, images)
     return found
 
@@ -261,7 +292,11 @@ def limb_of(dof: str) -> str:
 def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], shots: Sequence[Shot]) -> str:
     """The whole page. Names of the take, its views and its files are text, wherever they come from."""
     record, take = report.record, report.record["take"].rsplit("/", 1)[-1]
-    sections = [*_picture_sections(files), ("Over time", _over_time(report)), ("All figures", _all_figures(record, rows))]
+    sections = [
+        *_picture_sections(files, loop_words(record["stages"])),
+        ("Over time", _over_time(report)),
+        ("All figures", _all_figures(record, rows)),
+    ]
     if recorded := _recording(report):
         sections.insert(0, ("Cameras and person", recorded))
     links = " · ".join(f'<a href="#part{n}">{title}</a>' for n, (title, _) in enumerate(sections))
@@ -305,14 +340,19 @@ def _recording(report: Report) -> str:
     return f'<div class="first">{plan(shown)}<p>{html.escape(words(shown))}</p></div>' if shown else ""
 
 
-def _picture_sections(files: Mapping[str, tuple[str, bytes]]) -> list[tuple[str, str]]:
-    """Titles and pictures of the papers' figures."""
+def _picture_sections(files: Mapping[str, tuple[str, bytes]], loop: str) -> list[tuple[str, str]]:
+    """Titles and pictures of the papers' figures; that of the closed loop begins with the words about it."""
     found = {
         kind: [figure(*files[name]) for name in files if name.startswith((f"{kind}_", f"{kind}."))] for kind in sum(KINDS.values(), ())
     }
-    sections = [(title, "".join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])) for title, kinds in KINDS.items()]
-    axes = {title: REST_AXES if "layers" in kinds else AXES for title, kinds in KINDS.items()}
-    return [(title, f'{content}<p class="soft">{axes[title]}</p>') for title, content in sections if content]
+    sections = list[tuple[str, str]]()
+    for title, kinds in KINDS.items():
+        content = "".join(_picture_row(kind, found[kind]) for kind in kinds if found[kind])
+        axes = f'<p class="soft">{REST_AXES if "layers" in kinds else AXES}</p>' if content else ""
+        said = f"<p>{html.escape(loop)}</p>" if title == LOOP and loop else ""
+        if content or said:
+            sections.append((title, f"{said}{content}{axes}"))
+    return sections
 
 
 def _over_time(report: Report) -> str:

@@ -10,7 +10,7 @@ from ..geometry.raster import shade
 from ..geometry.robust import finite_median
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
-from .drawing import OF_PANELS, add_axes, add_colour_bar, add_scale, value_colours
+from .drawing import FRONT, GROUND, OF_PANELS, SIDE, value_colours, with_strip, with_title
 from .person import Mesh
 from .silhouettes import outlines_of
 
@@ -57,20 +57,23 @@ def _draw_bones(picture: np.ndarray, camera: Camera, shape: BodyShape, values: n
     return picture
 
 
-def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajectories, index: int) -> np.ndarray:
-    """The points visible in one frame with their paths up to it, coloured by speed (blue slow, red fast), over one view."""
+def high_speed(trajectories: Trajectories, index: int) -> float:
+    """The speed [m/s] that nearly no point of a frame exceeds; NaN if none is visible."""
+    speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, trajectories.visible[index]], axis=1))
+    return max(SLOW_M_S, float(np.percentile(speed, 98))) if len(speed) else float("nan")
+
+
+def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajectories, index: int, high: float) -> np.ndarray:
+    """The points visible in one frame with their paths up to it, coloured by speed (blue 0, red `high` [m/s]), over one view."""
     picture = colour(grey)
     first = max(0, index - TAIL_FRAMES)
     visible = trajectories.visible[index]
     paths = camera.project(trajectories.xyz_m[first : index + 1, visible])
     speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, visible], axis=1))
-    high = max(SLOW_M_S, float(np.percentile(speed, 98)) if len(speed) else 0.0)
     for xy, c in zip(paths.transpose(1, 0, 2), value_colours(speed, 0.0, high).tolist()):
         xy = xy[np.isfinite(xy).all(axis=1)]
         cv2.polylines(picture, [np.rint(xy * 8).astype(np.int32)], False, c, 1, cv2.LINE_AA, 3)
         cv2.circle(picture, _point(xy[-1]), 2, c, -1, cv2.LINE_AA)
-    if len(speed):
-        add_colour_bar(picture, high, "speed, m/s")
     return picture
 
 
@@ -79,7 +82,7 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     p = camera.to_camera(cloud.xyz_m)
     n = cloud.normals @ camera.R_cam_world.T
     if not len(p):
-        return np.zeros((PANEL_PX, 2 * PANEL_PX, 3), np.uint8)
+        return np.full((PANEL_PX, 2 * PANEL_PX, 3), GROUND, np.uint8)
     centre = np.median(p, axis=0)
     extent = np.percentile(np.abs(p - centre), 99, axis=0).max()
     scale = 0.46 * PANEL_PX / max(float(extent), 1e-3)
@@ -90,15 +93,15 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     across = float(np.percentile(np.abs(p - centre)[:, [0, 2]], 99)) * scale
     width = NARROW_PX if across < 0.46 * NARROW_PX else PANEL_PX
     pair = [_points_picture((p - centre) @ R.T, n @ R.T, scale, radius, light, width) for R, light in lit]
-    for picture, names in zip(pair, (("x", "y"), ("z", "y"))):
-        add_scale(picture, scale, size=OF_PANELS)
-        add_axes(picture, names, left=names[0] == "z", size=OF_PANELS)
-    return np.hstack(pair)
+    shown = []
+    for picture, words, names in zip(pair, (FRONT, SIDE), (("x", "y"), ("z", "y"))):
+        shown.append(with_title(with_strip(picture, scale, names, left=names[0] == "z", size=OF_PANELS), words, OF_PANELS))
+    return np.hstack(shown)
 
 
 def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int, light: np.ndarray, width: int) -> np.ndarray:
     """Points as discs, far ones first, lit along a unit vector (3,)."""
-    picture = np.full((PANEL_PX, width, 3), 28, np.uint8)
+    picture = np.full((PANEL_PX, width, 3), GROUND, np.uint8)
     grey = 60 + 195 * np.clip(n @ light, 0, 1)
     for i in np.argsort(-p[:, 2]):
         at = (round(width / 2 + p[i, 0] * scale), round(PANEL_PX / 2 + p[i, 1] * scale))
@@ -106,13 +109,11 @@ def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int, lig
     return picture
 
 
-def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray, high: float, words: str, radius: int = 1) -> np.ndarray:
-    """Matched points over one view, coloured by a value from blue (0) to red (high); `words` are those of the bar of colours."""
+def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray, high: float, radius: int = 1) -> np.ndarray:
+    """Matched points over one view, coloured by a value from blue (0) to red (high)."""
     picture = colour(grey)
     for xy, c in zip(xy_px, value_colours(values, 0.0, high).tolist()):
         cv2.circle(picture, _point(xy), radius, c, -1, cv2.LINE_AA)
-    if len(values):
-        add_colour_bar(picture, high, words)
     return picture
 
 
@@ -121,14 +122,13 @@ def colour(grey: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(np.clip(grey, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
 
 
-def with_scale(picture: np.ndarray, camera: Camera, xyz_m: np.ndarray) -> np.ndarray:
-    """A picture over footage with the scale at the median depth of points (N, 3), and with the camera's axes."""
+def with_scale(picture: np.ndarray, camera: Camera, xyz_m: np.ndarray, bar: tuple[float, str] | None = None) -> np.ndarray:
+    """A picture over footage above the scale at the median depth of points (N, 3), the camera's axes, and a bar of colours: its upper
+    end and words (none where that is not finite)."""
     depth = camera.to_camera(xyz_m)[:, 2] if len(xyz_m) else np.zeros(0)
     near = finite_median(np.where(depth > 0, depth, np.nan))
-    if np.isfinite(near):
-        add_scale(picture, camera.focal_px / near, "at the person")
-    add_axes(picture, ("x", "y"))
-    return picture
+    shown = bar if bar is not None and np.isfinite(bar[0]) else None
+    return with_strip(picture, camera.focal_px / near if np.isfinite(near) else float("nan"), note="at the person", bar=shown)
 
 
 def png(picture: np.ndarray) -> bytes:

@@ -1,6 +1,7 @@
 """Trajectories before and after the filters, from the front and from the side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all that were
 tracked, what was removed, by reason, and what was kept."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -8,17 +9,17 @@ import numpy as np
 
 from ..foundation import store
 from ..geometry.camera import Camera
-from ..tracking.reasons import COLOUR_WORDS, REASON_COLOURS
+from ..tracking.reasons import COLOUR_WORDS, MEANINGS, OTHERS, REASON_COLOURS
 from ..tracking.settings import TrackStatus
 from ..tracking.trajectories import Trajectories
-from .drawing import OF_PANELS, add_axes, add_colour_bar, add_scale, value_colours
+from .drawing import FRONT, GROUND, OF_PANELS, SIDE, value_colours, with_legend, with_strip, with_title
 
 SIDE_PX = 360
 MOST_ARROWS = 700  # in one picture; of more, every n-th point
 ARROW = 0.12  # length of the longest arrows, by half the picture; of the few beyond them at most …
 MOST_LONG = 2.0  # … this many times as long
 MOST_PLACES = 60_000  # in one picture; of more, every n-th trajectory
-GROUND = (28, 28, 28)
+VECTORS = {"velocity": ("velocities", "m/s"), "acceleration": ("accelerations", "m/s²")}  # and their units
 ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
 
 
@@ -40,43 +41,61 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     limits = limits_of(place[seen])
     removed = seen & ~kept
     reason = np.where(removed, status, 0)
-    colours = np.full((*status.shape, 3), (150, 150, 150), dtype=np.int64)
+    colours = np.full((*status.shape, 3), OTHERS, dtype=np.int64)
     for value, colour in REASON_COLOURS.items():
         colours[reason == value] = colour
     grey, green = (np.broadcast_to(np.array(c), colours.shape) for c in (ALL_COLOUR, KEPT_COLOUR))
     some = f", one trajectory in {every}" if every > 1 else ""
     both = f"from the front and from the right side{some}"
+    wanted = (
+        (f"All {int(seen.sum()):,} tracked positions before the filters, {both}", seen, grey, [(ALL_COLOUR, "tracked")]),
+        (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", removed, colours, MEANINGS),
+        (f"The {int(kept.sum()):,} positions that were kept, {both}", kept, green, [(KEPT_COLOUR, "kept")]),
+    )
     return [
-        (f"All {int(seen.sum()):,} tracked positions before the filters, {both}", both_views(place, seen, grey, limits)),
-        (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", both_views(place, removed, colours, limits)),
-        (f"The {int(kept.sum()):,} positions that were kept, {both}", both_views(place, kept, green, limits)),
+        (words, with_legend(framed(both_views(place, shown, tints, limits), limits[1]), meanings, OF_PANELS))
+        for words, shown, tints, meanings in wanted
     ]
 
 
-def vector_pictures(trajectories: Trajectories, camera: Camera, index: int) -> list[tuple[str, np.ndarray]]:
+def longest_vectors(trajectories: Trajectories, index: int) -> dict[str, float]:
+    """The size of the longest arrows in one frame, by the name in `VECTORS`: nearly no point exceeds it. Without those that have none."""
+    found = dict[str, float]()
+    for name, (_, _, vectors) in _vectors(trajectories, index).items():
+        size = np.linalg.norm(vectors, axis=1)
+        size = size[np.isfinite(size)]
+        if len(size):
+            found[name] = max(float(np.percentile(size, 95)), 1e-6)
+    return found
+
+
+def vector_pictures(
+    trajectories: Trajectories, camera: Camera, index: int, longest: Mapping[str, float]
+) -> dict[str, tuple[str, np.ndarray]]:
     """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the front and from the side
-    (D'Apuzzo et al. 1999, Fig. 9); none without any."""
-    found, place = [], camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
-    for name, unit, vectors in (
-        ("velocities", "m/s", trajectories.velocity_m_s[index]),
-        ("accelerations", "m/s²", trajectories.acceleration_m_s2[index]),
-    ):
-        own = vectors.astype(np.float64) @ camera.R_cam_world.T
+    (D'Apuzzo et al. 1999, Fig. 9), by the name in `VECTORS`; of those that are in `longest`, the size of the longest and red arrows."""
+    found, place = dict[str, tuple[str, np.ndarray]](), camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
+    for key, (name, unit, vectors) in _vectors(trajectories, index).items():
+        own = vectors @ camera.R_cam_world.T
         rows = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(own).all(axis=1))
-        if not len(rows):
+        if key not in longest or not len(rows):
             continue
-        every = max(1, -(-len(rows) // MOST_ARROWS))
+        every, high = max(1, -(-len(rows) // MOST_ARROWS)), longest[key]
         rows = rows[::every]
-        size = np.linalg.norm(own[rows], axis=1)
-        longest = max(float(np.percentile(size, 95)), 1e-6)
-        limits = limits_of(place[rows])
-        arrows = own[rows] * (ARROW * limits[1] / longest * np.minimum(1.0, MOST_LONG * longest / np.maximum(size, 1e-12)))[:, None]
-        pair = [_arrows(place[rows], arrows, size / longest, limits, axes) for axes in ("xy", "zy")]
+        size, limits = np.linalg.norm(own[rows], axis=1), limits_of(place[rows])
+        arrows = own[rows] * (ARROW * limits[1] / high * np.minimum(1.0, MOST_LONG * high / np.maximum(size, 1e-12)))[:, None]
+        pair = [_arrows(place[rows], arrows, size / high, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
         words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
-        add_colour_bar(pair[0], longest, f"{name}, {unit.replace('²', '^2')}")
-        found.append((f"{words}; red and longest: {longest:.2g} {unit} or more", np.hstack(pair)))
+        shown = framed(pair, limits[1], (high, f"{name}, {unit.replace('²', '^2')}"), 1.0)
+        found[key] = (f"{words}; red and longest: {high:.2g} {unit} or more", shown)
     return found
+
+
+def _vectors(trajectories: Trajectories, index: int) -> dict[str, tuple[str, str, np.ndarray]]:
+    """Name, unit and vectors (N, 3) in one frame."""
+    both = trajectories.velocity_m_s, trajectories.acceleration_m_s2
+    return {key: (*words, vectors[index].astype(np.float64)) for (key, words), vectors in zip(VECTORS.items(), both)}
 
 
 def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tuple[np.ndarray, float], axes: str) -> np.ndarray:
@@ -88,8 +107,6 @@ def _arrows(place: np.ndarray, arrows: np.ndarray, share: np.ndarray, limits: tu
     ends = np.clip(np.rint(8 * np.stack([start, end], axis=1)), -(2**20), 2**20).astype(int)
     for (a, b), tint in zip(ends.tolist(), tints.tolist()):
         cv2.arrowedLine(picture, a, b, tint, 1, cv2.LINE_AA, 3, 0.3)
-    add_scale(picture, SIDE_PX / 2 / half)
-    add_axes(picture, (axes[0], axes[1]), left=axes == "zy")
     return picture
 
 
@@ -99,24 +116,30 @@ def limits_of(points: np.ndarray) -> tuple[np.ndarray, float]:
     return 0.5 * (low + high), max(0.55 * float((high - low).max()), 0.01)
 
 
-def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits: tuple[np.ndarray, float]) -> np.ndarray:
-    """Both views of places (T, N, 3) in the camera's axes, of those that are `shown` (T, N), with a scale."""
+def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits: tuple[np.ndarray, float]) -> list[np.ndarray]:
+    """Both views of places (T, N, 3) in the camera's axes, of those that are `shown` (T, N)."""
     middle, half = limits
     pair = []
-    for axes, signs, names in (((0, 1), (1, 1), ("x", "y")), ((2, 1), (-1, 1), ("z", "y"))):
+    for axes, signs in (((0, 1), (1, 1)), ((2, 1), (-1, 1))):
         xy = SIDE_PX / 2 * (1 + (place[..., axes] - middle[list(axes)]) * signs / half)
-        pair.append(_trails(xy, shown, colours, half, names))
-    return np.hstack(pair)
+        pair.append(_trails(xy, shown, colours))
+    return pair
 
 
-def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray, half_m: float, names: tuple[str, str]) -> np.ndarray:
-    """The steps to the shown places as lines, with a scale and the axes."""
+def framed(pair: Sequence[np.ndarray], half_m: float, bar: tuple[float, str] | None = None, size: float = OF_PANELS) -> np.ndarray:
+    """Both views beside each other with their names, scales and axes; the first with the bar of colours."""
+    scale, panels = pair[0].shape[0] / 2 / half_m, []
+    for picture, words, axes, own in zip(pair, (FRONT, SIDE), (("x", "y"), ("z", "y")), (bar, None)):
+        panels.append(with_title(with_strip(picture, scale, axes, left=axes[0] == "z", bar=own, size=size), words, size))
+    return np.hstack(panels)
+
+
+def _trails(xy: np.ndarray, shown: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """The steps to the shown places as lines."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), GROUND, np.uint8)
     pixel = np.clip(np.nan_to_num(xy), -9 * SIDE_PX, 9 * SIDE_PX)
     step = shown[1:] & np.isfinite(xy[:-1]).all(axis=2)
     lines, colour = np.rint(8 * np.stack([pixel[:-1][step], pixel[1:][step]], axis=1)).astype(np.int32), colours[1:][step]
     for one in np.unique(colour, axis=0):
         cv2.polylines(picture, list(lines[(colour == one).all(axis=1)]), False, one.tolist(), 1, cv2.LINE_AA, 3)
-    add_scale(picture, SIDE_PX / 2 / half_m, size=OF_PANELS)
-    add_axes(picture, names, left=names[0] == "z", size=OF_PANELS)
     return picture

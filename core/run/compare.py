@@ -1,11 +1,14 @@
 """`tricap compare`: one take with the published and with the default method, and the same measures of both side by side.
 
-Each method is a run of its own, in DIR/published and DIR/default, and resumes as any run does. The measures are computed from the files
-that both wrote, not from what a method reports about itself, except for times and sigmas.
+Each method is a run of its own, in DIR/published and DIR/default, and resumes as any run does. The default runs first: of a take without
+clicks it finds the joints, from which the published method then begins. The measures are computed from the files that both wrote, not from
+what a method reports about itself, except for times and sigmas. The colours of both reports have common scales.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, suppress
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +22,33 @@ from ..geometry.robust import finite_median, mad_sigma
 from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page, written
 from ..results.folder import Results, check_inside, check_separate_folder
+from ..take.take import Take
 from . import pipeline
+from .joints import pixels_of, with_joints
 from .settings import Overrides
-from .take_run import open_run
+from .take_run import Run, open_run
 
 PLACE_M = 0.02  # edge of the cubes in which coverage is counted
 SURFACE, TRACKS, BODY, TIME = "Surface", "Trajectories", "Body", "Time"  # groups of measures
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 
+@dataclass(frozen=True, kw_only=True)
+class Halves:
+    """The results of both methods; without the published one if it could not run. `notes`: sentences about that."""
+
+    folders: Mapping[str, Path]  # of results, by method, in the order of `METHODS`
+    notes: tuple[str, ...] = ()
+
+
 def run_both(
     take: Path, out: Path, overrides: Overrides, frames: tuple[int, int] | None, monitor: Monitor, *, restart: bool = False
-) -> list[Path]:
-    """Run both methods; the folders of their results, in the order of `METHODS`.
+) -> Halves:
+    """Run the default and then the published method. Joints that the default found without clicks are clicks for the published one.
 
     Raises:
-        InputError: see `pipeline.run`; or the overrides choose a preset, or one of the folders is a link out of `out`.
+        InputError: see `pipeline.run`, of the default method; or the overrides choose a preset, or one of the folders is a link out of
+            `out`.
         Cancelled: what is done is kept.
     """
     check_separate_folder(out)
@@ -42,25 +56,82 @@ def run_both(
         check_inside(real_path(out) / method, real_path(out))
     if "preset" in overrides.get("method", {}):
         raise InputError("A comparison runs both presets; leave out --preset.")
-    for method in METHODS:
-        with open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart) as run:
-            if not pipeline.is_complete(run):
-                monitor.begin(method)
-                run.close_ups = False  # the same part of the images in both reports
+
+    def opened(method: str, clicked: Callable[[Take], Take] | None = None) -> AbstractContextManager[Run]:
+        return open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart, clicked=clicked)
+
+    with ExitStack() as both:
+        both.callback(_remove_empty, out / PUBLISHED)
+        default = both.enter_context(opened(DEFAULT))
+        _complete(default, DEFAULT, monitor)
+        clicked, note = _found_joints(default)
+        try:
+            published = both.enter_context(opened(PUBLISHED, clicked))
+            published.pictured = _pictured(out / DEFAULT)
+            _complete(published, PUBLISHED, monitor)
+        except InputError as error:
+            return Halves(folders={DEFAULT: out / DEFAULT}, notes=(*note, f"The published method could not run: {error}"))
+        _alike((published, default), monitor)
+    return Halves(folders={method: out / method for method in METHODS}, notes=note)
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder unless something is in it."""
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _complete(run: Run, method: str, monitor: Monitor) -> None:
+    """Run what is not done yet."""
+    run.close_ups = False  # the same part of the images in both reports
+    if not pipeline.is_complete(run):
+        monitor.begin(method)
+        pipeline.all_stages(run, monitor)
+
+
+def _pictured(folder: Path) -> list[int]:
+    """The frames of the pictures in a report: those of both reports are beside each other."""
+    return sorted(int(path.stem.rpartition("_")[2]) for path in (folder / "report").glob("cloud_*.png"))
+
+
+def _found_joints(run: Run) -> tuple[Callable[[Take], Take] | None, tuple[str, ...]]:
+    """Whatever a run found without clicks as clicks, with a sentence about it; nothing if the take's own clicks were enough."""
+    start = run.record["stages"].get("fit", {}).get("start")
+    if start is None:
+        return None, ()
+    joints = pixels_of(run.footage, {name: np.array(xyz) for name, xyz in start["joints_m"].items()}, start["unsure"])
+    note = (
+        f"The take has not enough clicks for the published method: it began from {len(joints)} joints that the default method found in "
+        f"frame {start['frame']}, as if they had been clicked."
+    )
+    return partial(with_joints, frame=start["frame"], joints=joints), (note,)
+
+
+def _alike(runs: Sequence[Run], monitor: Monitor) -> None:
+    """Make the reports' colours of the same picture mean the same: reports with another scale than the common one are written again."""
+    own = [store.read_json(run.results.path("report", "report.json")).get("colour_limits", {}) for run in runs]
+    common = {name: max(limits[name] for limits in own) for name in own[0] if name in own[1]}
+    for run, limits in zip(runs, own):
+        if any(limits[name] != high for name, high in common.items()):
+            run.colour_limits = common
+            if run.measured or run.surfaceless:
+                pipeline.report(run, monitor)
+            else:  # it was complete before
                 pipeline.all_stages(run, monitor)
-    return [out / method for method in METHODS]
 
 
-def measures_of(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
-    """The measures that need no truth, of two results."""
-    return [*_of_clouds(folders, monitor), *_of_runs([Results(f).read_run() for f in folders])]
+def measures_of(halves: Halves, monitor: Monitor) -> list[Measure]:
+    """The measures that need no truth, of two results; NaN of a method without one."""
+    runs = {method: Results(folder).read_run() for method, folder in halves.folders.items()}
+    return [*_of_clouds(halves.folders, monitor), *_of_runs([runs.get(method, {"stages": {}}) for method in METHODS])]
 
 
-def write_comparison(out: Path, take: Path, folders: Sequence[Path], measures: Sequence[Measure]) -> None:
+def write_comparison(out: Path, take: Path, halves: Halves, measures: Sequence[Measure]) -> None:
     """Write DIR/compare.json and DIR/compare.html."""
     rows = [as_row(measure) for measure in measures]
-    store.write_json(out / "compare.json", {"format": "tricap-comparison", "version": 1, "take": str(take), "measures": rows})
-    store.write_text(out / "compare.html", comparison_page(real_path(take).name, measures, folders))
+    table = {"format": "tricap-comparison", "version": 1, "take": str(take), "notes": halves.notes, "measures": rows}
+    store.write_json(out / "compare.json", table)
+    store.write_text(out / "compare.html", comparison_page(real_path(take).name, measures, halves.folders, halves.notes))
 
 
 def as_row(measure: Measure) -> dict[str, Any]:
@@ -82,25 +153,28 @@ def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
         (TRACKS, "length of a trajectory (mean)", "frames", HIGHER, lambda s: s.get("track", {}).get("mean_length_frames")),
         (TRACKS, "trajectories removed or lost by tests", "%", NEITHER, lambda s: removed(s.get("track", {}))),
         (BODY, "reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
-        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(stage.get("seconds", 0.0) for stage in s.values())),
+        (TIME, "duration of all stages", "s", LOWER, lambda s: sum(v.get("seconds", 0.0) for v in s.values()) if s else None),
     )
     values = [[float(v) if (v := of(run["stages"])) is not None else float("nan") for run in runs] for *_, of in wanted]
     return [Measure(group=g, name=n, unit=u, published=a, default=b, better=c) for (g, n, u, c, _), (a, b) in zip(wanted, values)]
 
 
-def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
+def _of_clouds(folders: Mapping[str, Path], monitor: Monitor) -> list[Measure]:
     """Coverage and noise of the written clouds, measured in the same way in both."""
-    paths = sorted((folders[0] / "clouds").glob("*.ply"))
+    paths = sorted((folders[DEFAULT] / "clouds").glob("*.ply"))
     share, noise = [], []
     for i, path in enumerate(paths):
         monitor.step("compare", i, len(paths))
-        other = folders[1] / "clouds" / path.name
-        if other.is_file():
-            clouds = [read_ply(p).xyz_m for p in (path, other)]
+        files = [folders[method] / "clouds" / path.name for method in METHODS if method in folders]
+        if len(files) == len(METHODS) and all(file.is_file() for file in files):
+            clouds = [read_ply(file).xyz_m for file in files]
             places = [{tuple(p) for p in np.floor(xyz / PLACE_M).astype(int).tolist()} for xyz in clouds]
             either = len(places[0] | places[1])
             share.append([100 * len(p) / either if either else np.nan for p in places])
             noise.append([1e3 * surface_noise_m(xyz) for xyz in clouds])
+        elif len(files) == 1:
+            share.append([np.nan, np.nan])
+            noise.append([np.nan, 1e3 * surface_noise_m(read_ply(path).xyz_m)])
     columns = np.array([share, noise]).reshape(2, -1, 2)
     (a, b), (c, d) = ([finite_median(table[:, k]) for k in (0, 1)] for table in columns)
     return [

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from ..surface.measure import NothingMeasured, measure_frames
 from ..surface.resolution import measured_footage
 from ..surface.starts import MeasureSettings
 from ..take.footage import Footage, open_take
-from ..take.take import read_take
+from ..take.take import FrameClicks, Take, read_take
 from ..take.writing import read_table, write_table
 from .settings import Overrides, settings_of
 from .take_run import only_frames
@@ -79,14 +80,27 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
     return [measured.get(cloud.frame, cloud) for cloud in empty_clouds(footage)]
 
 
-def pixels_of(footage: Footage, start: StartJoints) -> dict[str, dict[str, list[float]]]:
-    """The found joints that people click, in the pixels of the views that show them; without those that are unsure."""
+def pixels_of(footage: Footage, xyz_m: Mapping[str, np.ndarray], unsure: Sequence[str]) -> dict[str, dict[str, list[float]]]:
+    """The found joints (3,) that people click, in the pixels of the views that show them; without those that are `unsure`."""
     found = dict[str, dict[str, list[float]]]()
-    for name, xyz in start.xyz_m.items():
-        if name.partition(".")[0] in CLICKED and name not in start.unsure:
+    for name, xyz in xyz_m.items():
+        if name.partition(".")[0] in CLICKED and name not in unsure:
             at = {c.name: c.project(xyz[None])[0] for c in footage.rig.cameras}
             found[name] = {view: np.round(xy, 1).tolist() for view, xy in at.items() if footage.rig[view].sees(xy)}
     return {name: at for name, at in found.items() if len(at) > 1}
+
+
+def with_joints(take: Take, frame: int, joints: Mapping[str, Mapping[str, Sequence[float]]]) -> Take:
+    """The take with joints of a frame [px] as if they had been clicked; its own clicks stay, as in `write_joints_as_clicks`."""
+    own, clicked = take.clicks, {key.frame: dict(key.joints) for key in take.keyframes}
+    clicked[own.frame] = clicked.get(own.frame, {}) | dict(own.joints)
+    found = {name: {view: np.array(xy, dtype=np.float64) for view, xy in at.items()} for name, at in joints.items()}
+    clicked[frame] = found | clicked.get(frame, {})
+    if own.frame == frame or not own.surface:
+        own = replace(own, frame=frame, joints=clicked.pop(frame))
+    else:
+        own = replace(own, joints=clicked.pop(own.frame))
+    return replace(take, clicks=own, keyframes=tuple(FrameClicks(frame=at, joints=there) for at, there in sorted(clicked.items()) if there))
 
 
 def write_joints_as_clicks(folder: Path, frame: int, joints: Mapping[str, Mapping[str, list[float]]]) -> bool:

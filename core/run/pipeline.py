@@ -142,6 +142,8 @@ def fit(run: Run, monitor: Monitor) -> None:
     noted: dict[str, Any] = {"start": start_figures(given.start)} if given.start is not None else {}
     if run.footage.take.body_model == AUTO_BODY:
         noted["chosen_model"] = given.model
+    if tracked_again and (loop := loop_of(run.settings["fitting"], body.shape.skeleton)) != OFF:
+        noted["closed_loop"] = loop
     noted[FITTED_WITH] = fitted_with(run.footage, run.settings, run.results.folder)
     run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **noted)
 
@@ -159,6 +161,7 @@ def report(run: Run, monitor: Monitor) -> None:
         silhouettes=run.silhouettes,
         doubtful=doubtful_frames(frame_table(run.measured.summaries, run.trajectories, run.body), run.body),
         close_ups=run.close_ups,
+        colour_limits=run.colour_limits,
     )
     write_report(run.results, shown, monitor, run.pictured)
     run.finish_stage("report", began)

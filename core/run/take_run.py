@@ -21,7 +21,7 @@ from ..surface.frames import MeasuredFrames
 from ..surface.resolution import measured_footage
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
-from ..take.take import read_take
+from ..take.take import Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import Trajectories
 from .engine import Engine
@@ -49,6 +49,7 @@ class Run:
     engine: Engine | None = None  # where the frames are measured; None: in this process
     pictured: Sequence[int] = ()  # the frames of the report's pictures; none: the first, a middle and the last
     close_ups: bool = True  # of the person, in the report
+    colour_limits: Mapping[str, float] = field(default_factory=dict)  # of pictures in the report, if not their own
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
@@ -118,16 +119,18 @@ def open_run(
     restart: bool = False,
     ignore_contours: bool = False,
     pictures: Sequence[int] = (),
+    clicked: Callable[[Take], Take] | None = None,
 ) -> Iterator[Run]:
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
     What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
-    `pictures`: the frames of the report's, by default a few.
+    `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
     """
     take = read_take(take_folder)
+    take = take if clicked is None else clicked(take)
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     if frames is not None:

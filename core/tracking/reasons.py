@@ -2,18 +2,20 @@
 
 from .settings import TrackStatus
 
-REASON_COLOURS = {  # BGR by reason; the others are grey
-    TrackStatus.NOT_FOUND: (60, 160, 250),
-    TrackStatus.NOT_MATCHED: (60, 160, 250),
-    TrackStatus.NOT_VERIFIED: (40, 220, 240),
-    TrackStatus.RAYS_MISS: (40, 220, 240),
-    TrackStatus.TOO_FAST: (70, 70, 240),
-    TrackStatus.ACCELERATES: (70, 70, 240),
-    TrackStatus.NOT_UNIFORM: (230, 110, 200),
-    TrackStatus.NOT_RIGID: (230, 110, 200),
-    TrackStatus.UNSUPPORTED: (230, 110, 200),
-    TrackStatus.UNCERTAIN: (230, 160, 70),
-}
-COLOUR_WORDS = (
-    "red too fast or accelerating, violet unlike its neighbours, blue uncertain, yellow not verified, orange not found, grey others"
+Colour = tuple[int, int, int]  # BGR
+REASONS: tuple[tuple[str, Colour, str, tuple[TrackStatus, ...]], ...] = (  # name of the colour, colour, meaning, reasons
+    ("red", (70, 70, 240), "too fast or accelerating", (TrackStatus.TOO_FAST, TrackStatus.ACCELERATES)),
+    (
+        "violet",
+        (230, 110, 200),
+        "unlike its neighbours",
+        (TrackStatus.NOT_UNIFORM, TrackStatus.NOT_RIGID, TrackStatus.UNSUPPORTED),
+    ),
+    ("blue", (230, 160, 70), "uncertain", (TrackStatus.UNCERTAIN,)),
+    ("yellow", (40, 220, 240), "not verified", (TrackStatus.NOT_VERIFIED, TrackStatus.RAYS_MISS)),
+    ("orange", (60, 160, 250), "not found", (TrackStatus.NOT_FOUND, TrackStatus.NOT_MATCHED)),
 )
+OTHERS: Colour = (150, 150, 150)
+REASON_COLOURS = {reason: colour for _, colour, _, reasons in REASONS for reason in reasons}  # the others are grey
+COLOUR_WORDS = ", ".join([*(f"{name} {meaning}" for name, _, meaning, _ in REASONS), "grey others"])
+MEANINGS = [*((colour, meaning) for _, colour, meaning, _ in REASONS), (OTHERS, "others")]

@@ -262,7 +262,7 @@ def test_joints_that_are_left_to_other_frames_are_not_written_as_clicks() -> Non
     joints = dict(zip(NAMES, _joints(_pose(0.0))))
     start = StartJoints(frame=0, xyz_m=joints, stature=1.0, model="full", probability=0.99, rivals={}, ask="elbow.R", unsure=("wrist.R",))
     footage = SimpleNamespace(rig=front_rig(WIDE_PX))
-    every, some = pixels_of(footage, replace(start, unsure=())), pixels_of(footage, start)
+    every, some = pixels_of(footage, start.xyz_m, ()), pixels_of(footage, start.xyz_m, start.unsure)
     assert set(every) - set(some) == {"wrist.R"} and "wrist.L" in some
 
 

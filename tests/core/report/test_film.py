@@ -15,7 +15,7 @@ from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.motion.formats.ply import write_mesh
-from tricap.core.report.film import BAR_PX, HEIGHT_PX, WIDTH_PX, write_film
+from tricap.core.report.film import BAR_PX, HEIGHT_PX, LEGEND_PX, WIDTH_PX, write_film
 from tricap.core.results.folder import Results
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
@@ -51,6 +51,22 @@ def test_the_body_is_over_every_frame(plane_take: Path, results: Results) -> Non
         panel = pictures[0][:height, k * width : (k + 1) * width].astype(int)
         assert 0.05 < (panel[..., 2] - panel[..., 0] > 30).mean() < 0.5
     assert not results.path("cache", "film.mp4").exists()
+
+
+def test_views_have_names_and_joints_a_legend(plane_take: Path, results: Results) -> None:
+    """A name in the corner of every view; under them the frame at the left, and at the right the colours of the sigmas."""
+    movie = cv2.VideoCapture(str(write_film(open_take(read_take(plane_take)), results, Monitor())))
+    picture = movie.read()[1].astype(int)
+    height, width = picture.shape[0] - BAR_PX, picture.shape[1] // 3
+    for k in range(3):
+        corner = picture[:32, k * width : k * width + 100]
+        assert (corner.min(axis=2) > 200).sum() > 30, "letters, which are white: the corner of the footage is grey"
+    bar = picture[height + 3 :]
+    colourful = np.flatnonzero((np.ptp(bar, axis=2) > 90).sum(axis=0) > 2)
+    assert np.ptp(colourful) > LEGEND_PX and colourful.min() > 0.5 * picture.shape[1]
+    first, last = (np.median(bar[:, c][np.ptp(bar[:, c], axis=1) > 90], axis=0) for c in (colourful.min() + 3, colourful.max() - 3))
+    assert first[0] > first[2] + 60 and last[2] > last[0] + 60, "from blue to red"
+    assert (bar[:, :60].min(axis=2) > 200).any() and (bar[:, -30:].min(axis=2) > 200).any()
 
 
 @pytest.mark.parametrize(

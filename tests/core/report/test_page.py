@@ -25,6 +25,7 @@ from tricap.core.report import overview
 from tricap.core.report.arrangement import arrangement, plan, words
 from tricap.core.report.close_up import alike, close_up
 from tricap.core.report.document import STYLE, document, figure, notes, table
+from tricap.core.report.drawing import GROUND, OF_PANELS, TITLE_PX
 from tricap.core.report.figures import figures_csv
 from tricap.core.report.film_strip import MOST_FRAMES, Shot, chosen_frames
 from tricap.core.report.graphs import SCRIPT, curve_graph
@@ -34,9 +35,9 @@ from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
-from tricap.core.report.trails import GROUND, KEPT_COLOUR, SIDE_PX, trail_pictures, vector_pictures
+from tricap.core.report.trails import KEPT_COLOUR, SIDE_PX, longest_vectors, trail_pictures, vector_pictures
 from tricap.core.run.record import REASONS
-from tricap.core.tracking.reasons import REASON_COLOURS
+from tricap.core.tracking.reasons import COLOUR_WORDS, MEANINGS, REASON_COLOURS
 from tricap.core.tracking.settings import TrackStatus
 from tricap.core.tracking.trajectories import with_kinematics
 
@@ -202,7 +203,9 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
     status[2:, 1], status[:, 2] = TrackStatus.TOO_FAST, TrackStatus.ABSENT
     (every, before), (removed, red), (kept, green) = trail_pictures(raw(tmp_path / "raw.npz", status), camera)
     assert "All 18 tracked" in every and "The 4 removed" in removed and "The 14 positions that were kept" in kept
-    assert before.shape == (SIDE_PX, 2 * SIDE_PX, 3)
+    assert before.shape[1] == 2 * SIDE_PX < 2 * before.shape[0]
+    top = round(TITLE_PX * OF_PANELS)
+    before, panels, green = (picture[top : top + SIDE_PX] for picture in (before, red, green))
 
     def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
         """A pixel between the ground and this colour: lines are as thin as a pixel, and smooth."""
@@ -210,7 +213,12 @@ def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> Non
         size = np.linalg.norm(over, axis=2)
         return bool((over @ wanted > 0.99 * size * np.linalg.norm(wanted))[size > 40].any())
 
-    assert has(red, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert has(panels, REASON_COLOURS[TrackStatus.TOO_FAST]) and not has(panels, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert not has(panels, REASON_COLOURS[TrackStatus.UNCERTAIN]) and not (panels == 255).all(axis=2).any(), "no words on the trails"
+    legend = red[top + SIDE_PX :].reshape(-1, 3)
+    for colour, meaning in MEANINGS:
+        assert (legend == colour).all(axis=1).sum() > 100, f"a swatch of {meaning}"
+    assert COLOUR_WORDS in removed and {*REASON_COLOURS.values()} < {colour for colour, _ in MEANINGS}
     assert before.any() and not has(before, REASON_COLOURS[TrackStatus.TOO_FAST])
     assert trail_pictures(tmp_path / "none.npz", camera) == []
     assert trail_pictures(raw(tmp_path / "empty.npz", np.zeros((3, 2), dtype=np.int8)), camera) == []
@@ -228,14 +236,18 @@ def test_vectors_point_where_the_points_go(scenes: Any) -> None:
         + 0.5 * t**2 * 0.01 * right
     )
     tracks = with_kinematics(np.arange(5), np.arange(5) / 10, xyz, np.full((5, 3), 1e-3), np.ones((5, 3), dtype=np.int8), 0)
-    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2)
+    longest = longest_vectors(tracks, 2)
+    (speed, front_and_side), (bend, _) = vector_pictures(tracks, camera, 2, longest).values()
     assert "velocities of 3 tracked points" in speed and "longest: 0.2 m/s" in speed and "longest: 1 m/s²" in bend
     front, side = np.split(front_and_side, 2, axis=1)
     red = [(p[..., 2].astype(int) - p[..., 0] > 60) & (p[..., 1] < 120) for p in (front, side)]
     columns = [len(np.unique(np.nonzero(r)[1])) for r in red]
     assert columns[0] > 15 and columns[0] > 2 * columns[1]
     empty = with_kinematics(np.arange(1), np.arange(1) / 10, xyz[:1], np.full((1, 3), 1e-3), np.ones((1, 3), dtype=np.int8), 0)
-    assert vector_pictures(empty, camera, 0) == [], "a single frame has no velocities"
+    assert longest_vectors(empty, 0) == {} == vector_pictures(empty, camera, 0, longest), "a single frame has no velocities"
+    (slow, paler), _ = vector_pictures(tracks, camera, 2, longest | {"velocity": 0.8}).values()
+    hue = np.split(paler, 2, axis=1)[0][round(TITLE_PX) :][:SIDE_PX]
+    assert "longest: 0.8 m/s" in slow and not ((hue[..., 2].astype(int) - hue[..., 0] > 60) & (hue[..., 1] < 120)).any()
 
 
 def page(tmp_path: Path) -> Path:

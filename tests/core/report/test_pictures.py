@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tricap.core.report import pictures
+from tricap.core.report.drawing import GROUND, OF_PANELS, ROOM_PX, ROW_PX, TITLE_PX, with_legend
 from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned, ticks
-from tricap.core.report.point_pictures import paths_in_space
+from tricap.core.report.point_pictures import COLOURS, paths_in_space, paths_over_footage
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 
@@ -65,12 +66,14 @@ def cloud(n: int) -> PointCloud:
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_clouds_are_drawn(scenes: Any, n: int) -> None:
     camera, c = scenes.three_cameras()["C"], cloud(n)
-    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 1.0, "sigma, mm")
+    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 1.0)
     assert over.shape == (150, 200, 3) and over.dtype == np.uint8
     assert (np.ptp(over, axis=2) > 0).any() == (n > 0)  # colour is what is measured
     front_and_side = pictures.cloud_views(c, camera, 4)
-    assert front_and_side.shape == (pictures.PANEL_PX, 2 * (pictures.NARROW_PX if n == 1 else pictures.PANEL_PX), 3)
-    assert front_and_side.max() > 28 if n else True
+    assert front_and_side.shape[1] == 2 * (pictures.NARROW_PX if n == 1 else pictures.PANEL_PX)
+    top = round(TITLE_PX * OF_PANELS) if n else 0
+    bare = front_and_side[top : top + pictures.PANEL_PX]
+    assert bare.shape[0] == pictures.PANEL_PX and (bare != GROUND).any() == (n > 0) and not (bare == 255).all(axis=2).any()
 
 
 @pytest.mark.parametrize("n", [0, 1, 20])
@@ -82,8 +85,36 @@ def test_tracks_are_drawn(scenes: Any, n: int) -> None:
     tracks = Trajectories(frames=np.arange(5), time_s=np.arange(5) / 25, xyz_m=xyz, velocity_m_s=velocity, acceleration_m_s2=velocity,
                           sigma_m=xyz[..., 0] * 0 + 1e-3, status=np.isfinite(xyz[..., 0]))  # fmt: skip
     for index in (0, 4):
-        picture = pictures.tracks_over_footage(GREY, scenes.three_cameras()["C"], tracks, index)
+        high = pictures.high_speed(tracks, index)
+        assert np.isfinite(high) == bool(tracks.visible[index].any())
+        picture = pictures.tracks_over_footage(GREY, scenes.three_cameras()["C"], tracks, index, high)
         assert picture.shape == (150, 200, 3) and (np.ptp(picture, axis=2) > 0).any() == bool(tracks.visible[index].any())
+
+
+@pytest.mark.parametrize("size", [(640, 480), (640, 538), (576, 720), (1920, 1080), (150, 200), (480, 640)])
+def test_nothing_lies_on_the_person(scenes: Any, size: tuple[int, int]) -> None:
+    """The picture stays as it is, whatever part of it the person takes; bar, scale and axes are under it and do not touch each other."""
+    picture = np.random.default_rng(5).integers(0, 255, (*size, 3)).astype(np.uint8)
+    drawn = pictures.with_scale(picture, scenes.three_cameras()["C"], np.array([[0.0, 0.0, 2.16]]), (4.9, "speed, m/s"))
+    assert np.array_equal(drawn[: size[0]], picture)
+    strip = drawn[size[0] :]
+    shown = (strip != GROUND).any(axis=2)
+    assert shown.any() and not shown[0].any() and not shown[-1].any() and not shown[:, 0].any() and not shown[:, -1].any()
+    gaps = np.diff(np.flatnonzero(np.diff(np.concatenate([[1], shown.any(axis=0), [1]]))))[::2]  # widths of the empty columns
+    k = min(max(1.0, max(size) / 400), size[1] / ROOM_PX)
+    assert (gaps[1:-1] >= 4 * k).sum() >= 2, "between the bar, the scale and the axes"
+    colourful = np.ptp(strip.astype(int), axis=2) > 60
+    assert colourful.any() and np.flatnonzero(colourful.any(axis=0)).max() < 0.4 * size[1]
+
+
+def test_a_legend_has_a_swatch_of_every_colour() -> None:
+    """In as many rows as its words need, under a picture that stays as it is."""
+    meanings = [((10 * n, 200, 30), f"meaning {n}") for n in range(9)]
+    picture = np.zeros((40, 360, 3), np.uint8)
+    drawn = with_legend(picture, meanings)
+    assert not drawn[:40].any() and all((drawn[40:] == colour).all(axis=2).sum() > 50 for colour, _ in meanings)
+    shown = (drawn[40:] != GROUND).any(axis=2)
+    assert not shown[:, 0].any() and not shown[:, -2:].any() and len(drawn) - 40 >= 3 * ROW_PX
 
 
 def test_png_and_grey() -> None:
@@ -101,6 +132,15 @@ def test_png_and_grey() -> None:
 def test_the_scale_has_round_values(low: float, high: float, labels: list[str]) -> None:
     found = ticks(low, high)
     assert [text for _, text in found] == labels and all(low <= value <= high for value, _ in found)
+
+
+def test_chosen_points_are_joined_and_have_names_within_the_image() -> None:
+    """A name at the right edge is written to the left; a line with an end that is not there is left out."""
+    xy = np.array([[[20.0, 60.0], [190.0, 60.0], [np.nan, np.nan]]])
+    plain, joined, gone = (paths_over_footage(GREY, ("a", "rightmost", "b"), xy, 0, j) for j in ((), (("a", "rightmost"),), (("a", "b"),)))
+    assert np.array_equal(plain, gone) and (joined != plain).any(axis=2)[58:63, 40:100].any(axis=0).all()
+    name = (np.abs(plain.astype(int) - COLOURS[1]).max(axis=2) < 60)[40:56]
+    assert name[:, :184].sum() > 30 and not name[:, 192:].any()
 
 
 def test_paths_of_chosen_points_have_names(scenes: Any) -> None:

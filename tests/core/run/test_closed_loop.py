@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.run import pipeline
+from tricap.core.run import closed_loop, pipeline
 from tricap.core.run.closed_loop import OFF, OUTLINES, TRACKS, loop_of
 from tricap.core.run.settings import settings_of
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
@@ -15,10 +15,13 @@ from tricap.core.synthetic.truth import read_truth
 from tricap.core.tracking.contour import ContourTable
 
 
-def test_the_loop_is_closed_where_it_is_asked_for() -> None:
+def test_the_loop_is_closed_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By default it is open; auto may close it for whole bodies only."""
     whole, arm = (read_model(name).skeleton for name in ("full", "arm.R"))
     assert [loop_of(FitSettings(closed_loop=word), arm) for word in (OFF, TRACKS, OUTLINES)] == [OFF, TRACKS, OUTLINES]
-    assert loop_of(FitSettings(), arm) == OFF and loop_of(FitSettings(), whole) in (OFF, TRACKS, OUTLINES)
+    assert loop_of(FitSettings(), arm) == OFF == loop_of(FitSettings(), whole)
+    monkeypatch.setattr(closed_loop, "FOR_WHOLE_BODIES", TRACKS)
+    assert loop_of(FitSettings(), arm) == OFF and loop_of(FitSettings(), whole) == TRACKS
     assert settings_of({}, {"method": {"preset": "published"}}, "take.toml")["fitting"].closed_loop == OFF
 
 
@@ -40,6 +43,11 @@ def test_a_run_through_the_loop(tmp_path: Path) -> None:
         sleeve = sleeve[np.linalg.norm(sleeve - camera.project(elbow[0]), axis=1) < 15]
         apart = np.linalg.norm(table[0].xy_px[:, None] - sleeve, axis=2).min(axis=1)
         assert apart.min() < 3.0
+    assert first.record["stages"]["fit"]["closed_loop"] == OUTLINES
+    shown = {path.name for path in (out / "report").glob("outlines_*.png")}
+    assert shown == {f"outlines_0002_{camera.name}.png" for camera in rig.cameras}
+    page = (out / "report" / "report.html").read_text()
+    assert ">The closed loop</h2>" in page and f"closed once (fitting.closed_loop = {OUTLINES})" in page
     kept = (out / "joints.csv").read_bytes()
     (out / "joints.csv").unlink()
     pipeline.run(tmp_path / "take", out, settings)

@@ -12,6 +12,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.interlace import row_grid
 from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.report.point_pictures import COLOURS
 from tricap.core.tracking.planar import PlanarTracks, track_planar
 from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
@@ -120,6 +121,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     last = np.array(lines[-1].split(",")[2:4], dtype=float)
     assert np.allclose(last, place(3)[0] @ (82, 100) + place(3)[1], atol=0.3)
     assert len(list((tmp_path / "p").glob("*.png"))) == 4
+    picture = cv2.imread(str(tmp_path / "p" / "0003.png")).astype(int)
+    for tint, (x, y) in zip(COLOURS, (place(3)[0] @ xy + place(3)[1] for xy in np.array([[80, 70], [82, 100]]))):
+        near = np.abs(picture - tint).max(axis=2) < 60
+        x, y = round(float(x)), round(float(y))
+        assert near[y - 3 : y + 4, x - 3 : x + 4].sum() > 5, "a cross"
+        assert near[y - 16 : y - 3, x + 8 : x + 40].sum() > 15, "a name above it, to the right"
     table_read = read_planar(out)
     assert table_read.names == ("nose", "chin") and table_read.frames.tolist() == [0, 1, 2, 3] and np.allclose(table_read.xy_px[3, 1], last)
     for text, said in (("point,x,y\na,1,nan\n", "line 2"), ("point,x\na,1\n", "“y”"), ("point,x,y\na,500,5\n", "outside"),
