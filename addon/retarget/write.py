@@ -10,6 +10,7 @@ from ...core.geometry.rotation import continuous, euler_from_matrix, quaternion_
 from ...core.motion.retarget.residual_motion import ResidualMotion, to_text
 from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import needed_keys
+from ..scene.action import key
 from .read import RESIDUAL_KEY, keys_digest, scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
@@ -111,14 +112,8 @@ def location_values(target: bpy.types.Object, bone: bpy.types.PoseBone, result: 
 
 
 def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: np.ndarray, values: np.ndarray, group: str) -> int:
-    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
     for i in range(values.shape[1]):
-        curve = action.fcurve_ensure_for_datablock(owner, path, index=i)
-        points = curve.keyframe_points
-        points.add(len(frames))
-        points.foreach_set("co", np.stack([frames, values[:, i]], axis=1).astype(np.float32).ravel())
-        points.foreach_set("interpolation", np.full(len(frames), linear, dtype=np.int32))
-        curve.update()
+        key(action, owner, path, i, frames, values[:, i], group=group)
     return len(frames) * values.shape[1]
 
 
@@ -148,10 +143,10 @@ def _key_properties(
     keys = 0
     for name, values in properties.items():
         bone = target.pose.bones.get(name)
-        for key, value in values.items() if bone is not None else ():
-            if key in bone:
-                bone[key] = type(bone[key])(value)
-                path = f'{bone.path_from_id()}["{bpy.utils.escape_identifier(key)}"]'
+        for prop, value in values.items() if bone is not None else ():
+            if prop in bone:
+                bone[prop] = type(bone[prop])(value)
+                path = f'{bone.path_from_id()}["{bpy.utils.escape_identifier(prop)}"]'
                 keys += _key(action, target, path, at, np.full((1, 1), value), name)
     return keys
 
