@@ -21,7 +21,7 @@ from mathutils import Matrix, Vector
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
-from ..scene import stored
+from ..scene import excluded, stored
 from ..scene.armature import SNAPS_KEY
 from ..scene.standing import RIG_KEY, ROOT
 from . import metarig
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 CONSTRAINT = "Control rig"
 DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
 CORRECTIONS = "Corrections"
+WIDGETS_KEY = "tricap_widgets"  # custom property of the collection with the shapes of the controls
 LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
 CHECKED_FRAMES = 25
 MOST_TURNS, SMALLEST_TURN_RAD = 6, 1e-5  # of the base of an IK limb, until its middle joint is where it was
@@ -115,7 +116,7 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
     made = metarig.add_metarig(body, scene.collection)
     try:
         bpy.ops.pose.rigify_generate()
-        rig = made.data.rigify_target_rig
+        rig, widgets = made.data.rigify_target_rig, made.data.rigify_widgets_collection
     except RuntimeError as error:
         raise InputError(f"Rigify could not generate the controls: {str(error).strip()}") from error
     finally:
@@ -123,9 +124,21 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
         bpy.data.objects.remove(made)
         bpy.data.armatures.remove(data)
     rig.name = rig.data.name = f"{body.name} controls"
+    _put_below(body.users_collection[0], widgets)
     for text in set(bpy.data.texts) - before:
         text.use_module = True  # as Rigify: the panel of the rig comes back with the file
     return rig
+
+
+def _put_below(parent: bpy.types.Collection, widgets: bpy.types.Collection) -> None:
+    """Move the shapes of the controls below a collection; Rigify adds them to the user's active one. They stay excluded."""
+    scene = bpy.context.scene
+    for other in [scene.collection, *bpy.data.collections]:
+        if widgets in other.children.values():
+            other.children.unlink(widgets)
+    parent.children.link(widgets)
+    widgets[WIDGETS_KEY] = True
+    excluded.show(scene, WIDGETS_KEY, False)
 
 
 def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:

@@ -82,6 +82,24 @@ def a_correction_is_layered_and_exported(bpy: ModuleType, rig: Any, body: Any, w
     assert np.abs(found.head_m[11, found.rig.index["hand.L"]] - pose(body)[1][hand]).max() < 1e-4
 
 
+def test_the_shapes_of_the_controls_lie_with_the_body(blender: ModuleType) -> None:
+    """Rigify adds them to the collection that is active, which is the user's."""
+    body, scene = walker(blender), blender.context.scene
+    ours, mine = (blender.data.collections.new(name) for name in ("Body", "Mine"))
+    for collection in (ours, mine):
+        scene.collection.children.link(collection)
+    scene.collection.objects.unlink(body)
+    ours.objects.link(body)
+    blender.context.view_layer.active_layer_collection = blender.context.view_layer.layer_collection.children["Mine"]
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    rig = blender.data.objects["Body controls"]
+    assert not mine.children and not mine.objects and list(scene.collection.children) == [ours, mine]
+    (widgets,) = ours.children
+    assert all(bone.custom_shape.users_collection == (widgets,) for bone in rig.pose.bones if bone.custom_shape is not None)
+    assert blender.context.view_layer.layer_collection.children["Body"].children[0].exclude
+    assert blender.context.view_layer.active_layer_collection.name == "Mine"
+
+
 def test_a_body_that_was_placed_by_hand_and_a_second_rig(blender: ModuleType) -> None:
     """The body was turned and scaled; a hidden rig is not snapped; nothing is left of a deleted one when another is made."""
     body, scene = walker(blender), blender.context.scene
