@@ -9,7 +9,7 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ..scene import stored
 from ..scene.action import UNCERTAINTY
-from ..scene.standing import MEASURED_KEY, RIG_KEY, curves_of
+from ..scene.standing import MEASURED_KEY, controls_of_body, curves_of
 
 EDITED = "Edited motion"
 BONE = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.?(.*)')
@@ -28,8 +28,8 @@ def motion_curves(body: bpy.types.Object, *, selected: bool = False) -> list[bpy
     Raises:
         InputError: it plays no action of its own, a control rig drives it, or no bone with keys is selected.
     """
-    rig, data = stored.data_block(body, RIG_KEY, bpy.types.Object), body.animation_data
-    if rig is not None and rig.name in bpy.context.scene.objects:
+    rig, data = controls_of_body(body), body.animation_data
+    if rig is not None:
         raise InputError(f"“{rig.name}” drives “{body.name}”; edit the motion before the control rig is made, or delete that first.")
     if data is None or data.action is None or data.action_slot is None:
         raise InputError(f"“{body.name}” has no action to edit; choose one in the Action Editor, or build the rig again (step 7).")

@@ -57,7 +57,7 @@ class SnapLimbs(TellingOperator, bpy.types.Operator):
 
 def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
     """The buttons of a body's control rig in step 7."""
-    if control_rig.rig_of(body) is None:
+    if standing.controls_of_body(body) is None:
         layout.operator("tricap.make_control_rig", icon="OUTLINER_OB_ARMATURE")
         return
     row = layout.row(align=True)

@@ -21,9 +21,10 @@ from mathutils import Matrix, Vector
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
+from ..editing import foot_lock
 from ..scene import excluded, stored
 from ..scene.armature import SNAPS_KEY
-from ..scene.standing import RIG_KEY, ROOT
+from ..scene.standing import RIG_KEY, ROOT, controls_of_body
 from . import metarig
 from .playing import keyed_frames
 from .read import orthonormal, read_motion, read_rig, world_matrix
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 CONSTRAINT = "Control rig"
 DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
 CORRECTIONS = "Corrections"
+LOCKED_KEY = "tricap_was_locked"  # custom property of a body with a control rig: the baked motion has the foot lock, which is muted
 WIDGETS_KEY = "tricap_widgets"  # custom property of the collection with the shapes of the controls
 LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
 CHECKED_FRAMES = 25
@@ -63,11 +65,14 @@ def make_control_rig(body: bpy.types.Object) -> Made:
     Raises:
         InputError: the body has one already, is no whole body, or Rigify cannot be used.
     """
-    if rig_of(body) is not None:
-        raise InputError(f"“{body.name}” has the control rig “{rig_of(body).name}” already; delete it first to make another.")
+    if controls_of_body(body) is not None:
+        raise InputError(f"“{body.name}” has the control rig “{controls_of_body(body).name}” already; delete it first to make another.")
     _release(body)
     frames = keyed_frames(body)
     motion = read_motion(body, read_rig(body), frames)
+    if foot_lock.is_active(body):  # the motion has it already; its constraints would act on top of the controls
+        foot_lock.activate(body, False)
+        body[LOCKED_KEY] = True
     rig = _generated(body)
     rig.matrix_world = body.matrix_world
     _add_drive_bones(rig, body)
@@ -91,17 +96,14 @@ def _put_in_place_of(body: bpy.types.Object, rig: bpy.types.Object) -> None:
     body.hide_set(True)
 
 
-def rig_of(body: bpy.types.Object) -> bpy.types.Object | None:
-    """The control rig of a body, if it has one."""
-    rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
-    return rig if rig is not None and rig.type == "ARMATURE" and rig.name in bpy.context.scene.objects else None
-
-
 def _release(body: bpy.types.Object) -> None:
-    """Let nothing drive the body that is left of a deleted control rig: constraints, and the rig itself, which the body's property kept."""
+    """Let nothing drive the body that is left of a deleted control rig: constraints, and the rig itself, which the body's property kept.
+    The foot lock acts again."""
     for bone in body.pose.bones:
         for constraint in [c for c in bone.constraints if c.name == CONSTRAINT]:
             bone.constraints.remove(constraint)
+    if body.pop(LOCKED_KEY, False):
+        foot_lock.activate(body, True)
     deleted = stored.data_block(body, RIG_KEY, bpy.types.Object)
     body.pop(RIG_KEY, None)
     if deleted is not None and not deleted.users_collection:
@@ -270,7 +272,7 @@ def snap(body: bpy.types.Object, to: str, limbs: Sequence[str] = ()) -> int:
     Raises:
         InputError: the body has no control rig, the rig is hidden, there is no such limb, or the script of the rig does not run.
     """
-    rig = rig_of(body)
+    rig = controls_of_body(body)
     if rig is None:
         raise InputError(f"“{body.name}” has no control rig; press Make Control Rig first.")
     if not rig.visible_get():
