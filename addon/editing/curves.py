@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.foundation.errors import InputError
 from ..scene import stored
-from ..scene.action import UNCERTAINTY
+from ..scene.action import UNCERTAINTY, set_keys
 from ..scene.standing import MEASURED_KEY, controls_of_body, curves_of
 
 EDITED = "Edited motion"
@@ -60,6 +60,15 @@ def keys_of(curve: bpy.types.FCurve) -> tuple[np.ndarray, np.ndarray]:
     curve.keyframe_points.foreach_get("co", flat)
     frames, values = flat.reshape(-1, 2).T.astype(float)
     return frames, values
+
+
+def replace_keys(curve: bpy.types.FCurve, frames: np.ndarray, values: np.ndarray) -> None:
+    """Give a curve keys with these values (n,) in some frames (n,); those of other frames stay."""
+    at, earlier = keys_of(curve)
+    others = ~np.isin(at, frames)
+    at, values = np.concatenate([at[others], frames]), np.concatenate([earlier[others], values])
+    order = np.argsort(at)
+    set_keys(curve, at[order], values[order])
 
 
 def sigma_curves(body: bpy.types.Object) -> Mapping[str, bpy.types.FCurve]:

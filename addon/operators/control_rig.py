@@ -4,7 +4,7 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from ..panels import TellingOperator
-from ..retarget import control_rig
+from ..retarget import control_rig, snapping
 from ..scene import standing
 
 
@@ -51,7 +51,7 @@ class SnapLimbs(TellingOperator, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Snap them."""
         limbs = [limb.strip() for limb in self.limbs.split(",") if limb.strip()]
-        count = control_rig.snap(body_of(context), self.to, limbs)
+        count = snapping.snap(body_of(context), self.to, limbs)
         return f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} now."
 
 

@@ -17,6 +17,13 @@ SINGLE = ("pelvis", "spine", "chest", "neck", "head", "shoulder.L", "shoulder.R"
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 PARENTS = {"spine": "pelvis", "chest": "spine", "neck": "chest", "head": "neck", "shoulder": "chest", "arm": "shoulder", "leg": "pelvis"}
 PREFIX = "Metarig of "
+DRIVE = "BODY-"  # prefix of the bones of a control rig that the body's bones copy
+
+
+def control_of(bone: str) -> str:
+    """The FK control of a bone of the body."""
+    part, _, side = bone.partition(".")
+    return f"{part}_fk.{side}" if any(part in chain for chain in LIMBS.values()) else bone
 
 
 def needed_bones() -> tuple[str, ...]:
@@ -105,7 +112,7 @@ def _is_foot(part: str) -> bool:
     return part in ("toe", "heel.02")
 
 
-def bent_rest(body: bpy.types.Object, controls: bpy.types.Object, name: str, control: str) -> np.ndarray:
-    """A (3, 3): rotates the rest direction of a control to that of the body's bone."""
-    here, there = (np.array(o.data.bones[bone].matrix_local)[:3, 1] for o, bone in ((body, name), (controls, control)))
+def bent(rig: bpy.types.Object, body: bpy.types.Object, name: str) -> np.ndarray:
+    """A (3, 3): rotates the rest direction of the control rig's bone to that of the body's."""
+    here, there = (np.array(o.data.bones[bone].matrix_local)[:3, 1] for o, bone in ((body, name), (rig, f"ORG-{name}")))
     return np.array(Vector(there).rotation_difference(Vector(here)).to_matrix())

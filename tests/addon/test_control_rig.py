@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
 from tricap.core.geometry.rotation import angle_of, transposed
 from tricap.core.motion.formats.bvh import read_bvh
 
-from .test_scene_standing import FRAMES, walker
+from .test_scene_standing import FRAMES, walk, walker
 
 ANGLE_DEG, PLACE_M = 0.2, 1e-3  # promised of the motion; measured 6e-5° and 5e-7 m
 SNAP_DEG, SNAP_M = 0.1, 1e-4  # promised of snapping; measured 4e-5° and 4e-7 m
@@ -102,6 +104,82 @@ def test_locked_feet_are_baked_and_the_lock_is_muted(blender: ModuleType) -> Non
             foot_lock.let_act(scene, True)
         assert not scene.tricap.foot_lock
         blender.data.objects.remove(blender.data.objects["Body controls"])
+
+
+BUMP = np.array([0.0, 0.3, 0.6, 0.2])  # radians, in the frames from 4 on
+PULLED = {"shoulder.L flexion": 1.0, "elbow.L flexion": 1.0, "hip.R flexion": -0.5, "pelvis z": 0.05}
+
+
+def fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let Fit Again, without a take, change the frames from 4 to 7 by BUMP."""
+    around, again = (
+        importlib.import_module(f"bl_ext.user_default.tricap.{name}") for name in ("core.run.around_clicks", "addon.correcting.fit_again")
+    )
+    shape = default_shape(read_model("full"))
+    before = walk(shape, 0.96)[4:8]
+    after = before.copy()
+    names = list(shape.skeleton.dof_names)
+    for name, part in PULLED.items():
+        after[:, names.index(name)] += part * BUMP
+    found = around.FittedAgain(shape=shape, frames=np.arange(4, 8), dof_names=tuple(names), before=before, after=after)
+    monkeypatch.setattr(again.project, "chosen", lambda scene, take, out: (Path(), Path(), {}))
+    monkeypatch.setattr(around, "fit_around_clicks", lambda *_: found)
+
+
+@pytest.mark.parametrize("path", ["BONE", "OBJECT"])
+def test_what_is_fitted_again_arrives_in_the_base_layer(blender: ModuleType, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    """With locked feet, a correction, and a control rig that was moved since."""
+    from mathutils import Matrix
+
+    fitted_again(monkeypatch)
+    body = locked(blender, path)
+    before = poses(blender.context.scene, body)
+    assert blender.ops.tricap.fit_again() == {"FINISHED"}
+    wanted = poses(blender.context.scene, body)
+    body = locked(blender, path)
+    scene = blender.context.scene
+    scene.frame_set(3)
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    rig = blender.data.objects["Body controls"]
+    moved = Matrix.Translation((0.5, -1.0, 0.0)) @ Matrix.Rotation(0.7, 4, "Z")
+    rig.matrix_world = moved @ rig.matrix_world
+    rig.pose.bones["forearm_fk.R"].rotation_quaternion = (0.9, 0.1, 0.0, 0.2)
+    rig.pose.bones["forearm_fk.R"].keyframe_insert("rotation_quaternion", frame=2)
+    corrected = poses(scene, body)
+    scene.frame_set(9)
+    assert blender.ops.tricap.fit_again() == {"FINISHED"} and scene.frame_current == 9
+    row = list(body.pose.bones.keys()).index("forearm.R")
+    for frame, (found, earlier) in enumerate(zip(poses(scene, body), corrected, strict=True)):
+        own = [b for b, bone in enumerate(body.pose.bones) if b != row and bone not in body.pose.bones["forearm.R"].children_recursive]
+        check_same(tuple(x[own] for x in found), tuple(x[own] for x in placed(wanted[frame], moved)), ANGLE_DEG, PLACE_M)
+        if frame not in range(4, 8):
+            check_same(found, earlier, 1e-3, 1e-6)
+    assert np.abs(wanted[6][1] - before[6][1]).max() > 0.05
+
+
+def test_the_base_layer_is_missing(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted_again(monkeypatch)
+    walker(blender)
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    tracks = blender.data.objects["Body controls"].animation_data.nla_tracks
+    tracks.remove(tracks[0])
+    with pytest.raises(RuntimeError, match="“Body controls” no longer plays its base layer.*delete it, and make it again"):
+        blender.ops.tricap.fit_again()
+
+
+def locked(bpy: ModuleType, path: str) -> Any:
+    """The walker with bent limbs and locked feet."""
+    body = walker(bpy)
+    bend(body)
+    bpy.context.scene.tricap.path = path
+    assert bpy.ops.tricap.lock_feet() == {"FINISHED"}
+    return body
+
+
+def placed(pose: tuple[np.ndarray, np.ndarray], by: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A pose after its body was moved."""
+    M = np.array(by)
+    return M[:3, :3] @ pose[0], pose[1] @ M[:3, :3].T + M[:3, 3]
 
 
 def poses(scene: Any, body: Any) -> list[tuple[np.ndarray, np.ndarray]]:
