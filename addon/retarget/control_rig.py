@@ -26,6 +26,7 @@ from .playing import keyed_frames
 from .read import read_motion, read_rig
 from .snapping import snaps_of
 
+STRETCH = "IK_Stretch"  # custom property of the bones with the switches of the limbs
 WIDGETS_KEY = "tricap_widgets"  # custom property of the collection with the shapes of the controls
 CHECKED_FRAMES = 25
 
@@ -57,6 +58,7 @@ def make_control_rig(body: bpy.types.Object) -> Made:
     rig.matrix_world = body.matrix_world
     _add_drive_bones(rig, body)
     bpy.context.view_layer.update()
+    _fix_lengths(rig)
     bake(rig, body, motion)
     _drive(body, rig)
     body[RIG_KEY] = rig
@@ -110,6 +112,14 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
     for text in set(bpy.data.texts) - before:
         text.use_module = True  # as Rigify: the panel of the rig comes back with the file
     return rig
+
+
+def _fix_lengths(rig: bpy.types.Object) -> None:
+    """Let IK neither stretch a limb nor, as Blender's does too, shorten it: by 3 % in a bent leg, which FK cannot show."""
+    for bone in rig.pose.bones:
+        bone.ik_stretch = 0.0
+        if STRETCH in bone:
+            bone[STRETCH] = 0.0
 
 
 def _put_below(parent: bpy.types.Collection, widgets: bpy.types.Collection) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mathutils import Matrix, Quaternion
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
@@ -68,8 +69,6 @@ def bend(body: Any) -> None:
 
 
 def a_correction_is_layered_and_exported(bpy: ModuleType, rig: Any, body: Any, wanted: list[Any], folder: Path) -> None:
-    from mathutils import Quaternion
-
     bpy.context.scene.frame_set(5)
     bone = rig.pose.bones["upper_arm_fk.L"]
     bone.rotation_quaternion = bone.rotation_quaternion @ Quaternion((1, 0, 0), 0.3)
@@ -106,6 +105,91 @@ def test_locked_feet_are_baked_and_the_lock_is_muted(blender: ModuleType) -> Non
         blender.data.objects.remove(blender.data.objects["Body controls"])
 
 
+def test_snapping_with_keys_changes_no_other_frame(blender: ModuleType) -> None:
+    """One key of IK would hold in all frames: 18° and 154 mm off. Curves of corrections keep their shape between their keys, too."""
+    body, scene = corrected(blender), blender.context.scene
+    rig, wanted = blender.data.objects["Body controls"], poses(scene, body)
+    scene.tool_settings.use_keyframe_insert_auto = True
+    for frame, to, limbs in (
+        (6, "IK", ""),
+        (7, "IK", "upper_arm.L"),
+        (9, "FK", ""),
+        (7, "FK", "upper_arm.L"),
+        (0, "IK", "thigh.L, thigh.R"),
+    ):
+        scene.frame_set(frame)
+        assert blender.ops.tricap.snap_limbs(to=to, limbs=limbs) == {"FINISHED"} and scene.frame_current == frame
+        check_same(pose(body), wanted[frame], SNAP_DEG, SNAP_M)
+        check_all(scene, body, wanted)
+    assert switches(scene, rig, "upper_arm.L") == [1.0] * 6 + [0.0] + [1.0] * 5
+    assert switches(scene, rig, "thigh.R") == [0.0] + [1.0] * 5 + [0.0] + [1.0] * 5
+
+
+def test_limbs_are_snapped_over_the_frames_that_are_played(blender: ModuleType) -> None:
+    """To IK in the preview range, where a foot is then moved, and back to FK with this correction."""
+    body, scene = corrected(blender), blender.context.scene
+    rig, wanted = blender.data.objects["Body controls"], poses(scene, body)
+    scene.use_preview_range, scene.frame_preview_start, scene.frame_preview_end = True, 3, 8
+    scene.frame_set(5)
+    mesh = blender.data.objects.new("Skin", blender.data.meshes.new("Skin"))
+    scene.collection.objects.link(mesh)
+    assert blender.ops.tricap.snap_limbs(to="IK", frames="PLAYED") == {"FINISHED"}
+    assert scene.frame_current == 5 and not mesh.hide_viewport
+    check_all(scene, body, wanted)
+    for limb in ("thigh.L", "upper_arm.R"):
+        assert switches(scene, rig, limb) == [1.0] * 3 + [0.0] * 6 + [1.0] * 3
+    lift(rig, "foot_ik.R", scene, range(4, 7))
+    lifted = poses(scene, body)
+    assert max(np.abs(lifted[5][1] - wanted[5][1]).max(axis=1)) > 0.02
+    assert blender.ops.tricap.snap_limbs(to="FK", limbs="thigh.R", frames="PLAYED") == {"FINISHED"}
+    check_all(scene, body, lifted)
+    assert switches(scene, rig, "thigh.R") == [1.0] * FRAMES and switches(scene, rig, "thigh.L")[5] == 0.0
+    scene.use_preview_range = False
+    assert blender.ops.tricap.snap_limbs(to="FK", frames="PLAYED") == {"FINISHED"}
+    check_all(scene, body, lifted)
+    assert not any(0.0 in switches(scene, rig, limb) for limb in ("thigh.L", "thigh.R", "upper_arm.L", "upper_arm.R"))
+    snapping = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.snapping")
+    with pytest.raises(snapping.InputError, match="plays no frames"):
+        snapping.snap_frames(body, "FK", (), range(0))
+
+
+def corrected(bpy: ModuleType) -> Any:
+    """A walker with a control rig whose arm has corrections with curved channels."""
+    body = walker(bpy)
+    bend(body)
+    assert bpy.ops.tricap.make_control_rig() == {"FINISHED"}
+    arm = bpy.data.objects["Body controls"].pose.bones["upper_arm_fk.L"]
+    for frame, turned in ((1, (1.0, 0.0, 0.0, 0.0)), (4, (0.9, 0.3, 0.0, 0.2)), (10, (0.9, -0.1, 0.3, 0.0))):
+        bpy.context.scene.frame_set(frame)
+        arm.rotation_quaternion = arm.rotation_quaternion @ Quaternion(turned).normalized()
+        arm.keyframe_insert("rotation_quaternion")
+    return body
+
+
+def check_all(scene: Any, body: Any, wanted: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    now = scene.frame_current
+    for found, before in zip(poses(scene, body, len(wanted)), wanted, strict=True):
+        check_same(found, before, SNAP_DEG, 5 * SNAP_M)  # after several changes; IK itself is not exact; measured 2e-4
+    scene.frame_set(now)
+
+
+def switches(scene: Any, rig: Any, limb: str) -> list[float]:
+    """Of a limb in every frame: 0 where IK moves it, 1 where FK does."""
+    part, side = limb.split(".")
+    found = []
+    for frame in range(FRAMES):
+        scene.frame_set(frame)
+        found.append(rig.pose.bones[f"{part}_parent.{side}"]["IK_FK"])
+    return found
+
+
+def lift(rig: Any, name: str, scene: Any, frames: range) -> None:
+    for frame in frames:
+        scene.frame_set(frame)
+        rig.pose.bones[name].matrix = Matrix.Translation((0.0, 0.0, 0.05)) @ rig.pose.bones[name].matrix
+        rig.pose.bones[name].keyframe_insert("location")
+
+
 BUMP = np.array([0.0, 0.3, 0.6, 0.2])  # radians, in the frames from 4 on
 PULLED = {"shoulder.L flexion": 1.0, "elbow.L flexion": 1.0, "hip.R flexion": -0.5, "pelvis z": 0.05}
 
@@ -129,8 +213,6 @@ def fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("path", ["BONE", "OBJECT"])
 def test_what_is_fitted_again_arrives_in_the_base_layer(blender: ModuleType, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
     """With locked feet, a correction, and a control rig that was moved since."""
-    from mathutils import Matrix
-
     fitted_again(monkeypatch)
     body = locked(blender, path)
     before = poses(blender.context.scene, body)
@@ -182,10 +264,10 @@ def placed(pose: tuple[np.ndarray, np.ndarray], by: Any) -> tuple[np.ndarray, np
     return M[:3, :3] @ pose[0], pose[1] @ M[:3, :3].T + M[:3, 3]
 
 
-def poses(scene: Any, body: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """`pose` in every frame of the scene."""
+def poses(scene: Any, body: Any, count: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
+    """`pose` in every frame of the scene, or in the first ones."""
     found = []
-    for frame in range(scene.frame_start, scene.frame_end + 1):
+    for frame in range(count or scene.frame_end + 1):
         scene.frame_set(frame)
         found.append(pose(body))
     return found
