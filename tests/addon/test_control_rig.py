@@ -190,6 +190,30 @@ def lift(rig: Any, name: str, scene: Any, frames: range) -> None:
         rig.pose.bones[name].keyframe_insert("location")
 
 
+def test_the_uncertainty_is_shown_where_the_controls_are(blender: ModuleType) -> None:
+    """The body is hidden under its control rig; its bones are where they were, and are chosen by their controls."""
+    uncertainty = importlib.import_module("bl_ext.user_default.tricap.addon.editing.uncertainty")
+    body, scene = walker(blender), blender.context.scene
+    bend(body)
+    sigmas = uncertainty.sigmas_of(body)
+    scene.frame_set(4)
+    before, sigma = uncertainty.bones_drawn(body, sigmas, 4)
+    assert len(before) == len(sigma) > 15 and len(uncertainty.bones_drawn(body, sigmas, 99)[0]) == 0
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    rig = blender.data.objects["Body controls"]
+    assert not body.visible_get()
+    np.testing.assert_allclose(uncertainty.bones_drawn(body, sigmas, 4)[0], before, atol=PLACE_M)
+    assert uncertainty.chosen_bones(body) == set()
+    blender.ops.object.mode_set(mode="POSE")
+    for bone in rig.pose.bones:
+        chosen = bone.name in ("forearm_fk.L", "hand_ik.R", "chest")
+        (bone if hasattr(bone, "select") else bone.bone).select = chosen  # Blender 5 selects pose bones
+    assert uncertainty.chosen_bones(body) == {"forearm.L", "hand.R", "chest"}
+    blender.ops.object.mode_set(mode="OBJECT")
+    rig.hide_set(True)
+    assert len(uncertainty.bones_drawn(body, sigmas, 4)[0]) == 0
+
+
 BUMP = np.array([0.0, 0.3, 0.6, 0.2])  # radians, in the frames from 4 on
 PULLED = {"shoulder.L flexion": 1.0, "elbow.L flexion": 1.0, "hip.R flexion": -0.5, "pelvis z": 0.05}
 
