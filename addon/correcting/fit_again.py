@@ -8,13 +8,13 @@ import numpy as np
 
 from ...core.foundation.progress import Monitor
 from .. import project
-from ..editing.curves import keys_of
+from ..editing.curves import replace_keys
 from ..operators.stages import Fit, StageOperator, run_and_read
 from ..overlay import canvas, results
+from ..retarget import base_layer
 from ..scene import stored
-from ..scene.action import set_keys
 from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
-from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, curves_of
+from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, controls_of_body, curves_of
 
 if TYPE_CHECKING:
     from ...core.run.around_clicks import FittedAgain
@@ -30,7 +30,13 @@ class FitAgain(StageOperator, bpy.types.Operator):
     take = out = ""  # those of the panel
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
-        """Folders and settings as they are now; writes the project's take.toml."""
+        """Folders and settings as they are now; writes the project's take.toml.
+
+        Raises:
+            InputError: the new frames could not be put into what a control rig plays; nothing was computed.
+        """
+        for body, rig in _controlled(context.scene):
+            base_layer.check_bakes(rig, body)
         take, out, overrides = project.chosen(context.scene, "", "")
 
         def compute(monitor: Monitor) -> Any:
@@ -42,16 +48,20 @@ class FitAgain(StageOperator, bpy.types.Operator):
         return compute
 
     def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
-        """Move the keys of the body in the scene, and report."""
+        """Move the keys of the body in the scene, and those of its control rig, and report."""
         if isinstance(result, tuple):
             return super().finish(context, result)
         for body in all_bodies(context.scene):
             move_keys(body, result)
+        for body, rig in _controlled(context.scene):
+            base_layer.bake_again(rig, body, result.frames)
         results.clear()
         _mark_again(context.scene)
         canvas.redraw_clips(context)
         context.scene.frame_set(context.scene.frame_current)
         self.report({"INFO"}, str(result))
+        for _, rig in _controlled(context.scene):
+            self.report({"INFO"}, f"The base layer of “{rig.name}” plays these frames as they are now; its corrections are as before.")
         return {"FINISHED"}
 
 
@@ -62,6 +72,11 @@ def _mark_again(scene: bpy.types.Scene) -> None:
 
     if (run := results.current(scene)) is not None:
         mark_doubtful(scene, doubtful_in(run.out, []))
+
+
+def _controlled(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bpy.types.Object]]:
+    """The bodies that a control rig drives, each with it."""
+    return [(body, rig) for body in all_bodies(scene) if (rig := controls_of_body(body)) is not None]
 
 
 def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
@@ -79,17 +94,8 @@ def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
     actions = {action for action in (body.animation_data and body.animation_data.action, measured) if action is not None}
     for curve in (curve for action in actions for curve in curves_of(action)):
         if (curve.data_path, curve.array_index) in moved:
-            _add(curve, again.frames, moved[curve.data_path, curve.array_index])
-
-
-def _add(curve: bpy.types.FCurve, frames: np.ndarray, change: np.ndarray) -> None:
-    """Add a change (n,) to a curve in some frames (n,), which get keys."""
-    at, values = keys_of(curve)
-    new = np.array([curve.evaluate(frame) for frame in frames]) + change
-    others = ~np.isin(at, frames)
-    at, values = np.concatenate([at[others], frames]), np.concatenate([values[others], new])
-    order = np.argsort(at)
-    set_keys(curve, at[order], values[order])
+            before = np.array([curve.evaluate(frame) for frame in again.frames])
+            replace_keys(curve, again.frames, before + moved[curve.data_path, curve.array_index])
 
 
 CLASSES = (FitAgain,)

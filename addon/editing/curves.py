@@ -8,8 +8,8 @@ import numpy as np
 
 from ...core.foundation.errors import InputError
 from ..scene import stored
-from ..scene.action import UNCERTAINTY
-from ..scene.standing import MEASURED_KEY, RIG_KEY, curves_of
+from ..scene.action import UNCERTAINTY, set_keys
+from ..scene.standing import MEASURED_KEY, controls_of_body, curves_of
 
 EDITED = "Edited motion"
 BONE = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.?(.*)')
@@ -28,8 +28,8 @@ def motion_curves(body: bpy.types.Object, *, selected: bool = False) -> list[bpy
     Raises:
         InputError: it plays no action of its own, a control rig drives it, or no bone with keys is selected.
     """
-    rig, data = stored.data_block(body, RIG_KEY, bpy.types.Object), body.animation_data
-    if rig is not None and rig.name in bpy.context.scene.objects:
+    rig, data = controls_of_body(body), body.animation_data
+    if rig is not None:
         raise InputError(f"“{rig.name}” drives “{body.name}”; edit the motion before the control rig is made, or delete that first.")
     if data is None or data.action is None or data.action_slot is None:
         raise InputError(f"“{body.name}” has no action to edit; choose one in the Action Editor, or build the rig again (step 7).")
@@ -60,6 +60,15 @@ def keys_of(curve: bpy.types.FCurve) -> tuple[np.ndarray, np.ndarray]:
     curve.keyframe_points.foreach_get("co", flat)
     frames, values = flat.reshape(-1, 2).T.astype(float)
     return frames, values
+
+
+def replace_keys(curve: bpy.types.FCurve, frames: np.ndarray, values: np.ndarray) -> None:
+    """Give a curve keys with these values (n,) in some frames (n,); those of other frames stay."""
+    at, earlier = keys_of(curve)
+    others = ~np.isin(at, frames)
+    at, values = np.concatenate([at[others], frames]), np.concatenate([earlier[others], values])
+    order = np.argsort(at)
+    set_keys(curve, at[order], values[order])
 
 
 def sigma_curves(body: bpy.types.Object) -> Mapping[str, bpy.types.FCurve]:

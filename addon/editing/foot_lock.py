@@ -25,7 +25,7 @@ from ..retarget.apply import map_of
 from ..retarget.playing import keyed_frames
 from ..retarget.read import read_motion, read_rig
 from ..scene.action import key
-from ..scene.standing import bags_of, dofs_of
+from ..scene.standing import all_bodies, bags_of, controls_of_body, dofs_of
 from .curves import edited_action, motion_curves
 
 LOCK, EMPTY, ACTION = "Foot lock", "Foot Lock", "Foot lock"
@@ -200,6 +200,20 @@ def activate(body: bpy.types.Object, active: bool) -> None:
     """Mute the foot lock of the body, or let it act again."""
     for _, constraint in _locks(body):
         constraint.mute = not active
+
+
+def let_act(scene: bpy.types.Scene, active: bool) -> None:
+    """Let the foot lock of the scene's bodies act, or mute it.
+
+    Raises:
+        InputError: a control rig drives a body, and the foot lock would act on top of it.
+    """
+    for body in all_bodies(scene):
+        rig = controls_of_body(body)
+        if rig is not None and active and is_locked(body):
+            raise InputError(f"“{rig.name}” drives “{body.name}” and plays the locked feet; delete it to let the foot lock act again.")
+    for body in all_bodies(scene):
+        activate(body, active)
 
 
 def remove(body: bpy.types.Object) -> bool:

@@ -7,6 +7,7 @@ import bpy
 from ...core.foundation.errors import InputError
 from ..operators.control_rig import body_of
 from ..panels import TellingOperator
+from ..scene.standing import controls_of_body
 from . import foot_lock, keys
 
 DEFAULT_ACCELERATION = math.radians(600)  # rad/s²: below that of quick limbs, so that only what is uncertain moves
@@ -107,6 +108,7 @@ def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
     inside.operator("tricap.smooth_uncertain", icon="MOD_SMOOTH")
     inside.operator("tricap.reduce_keys", icon="KEYFRAME")
     row = inside.row(align=True)
+    row.enabled = controls_of_body(body) is None  # the motion of a control rig has the lock already
     row.operator("tricap.lock_feet", icon="CON_FLOOR")
     if foot_lock.is_locked(body):
         row.prop(bpy.context.scene.tricap, "foot_lock", text="", icon="HIDE_OFF")

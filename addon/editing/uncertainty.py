@@ -2,6 +2,8 @@
 bones coloured by their sigma in the 3-D view. Colours: green where certain, by yellow to red at 10°.
 """
 
+import re
+
 import bpy
 import numpy as np
 
@@ -14,6 +16,7 @@ from .curves import BONE, keys_of, sigma_curves
 GREEN_DEG, RED_DEG = 1.0, 10.0
 QUARTILE = 0.75
 STRIP_PX, OPACITY, BONE_PX = 8.0, 0.9, 6.0
+CONTROL = re.compile(r"_(fk|ik)(?=\.|$)")  # of the names of controls
 EDITORS = ("SpaceDopeSheetEditor", "SpaceGraphEditor")
 
 Sigmas = dict[str, tuple[np.ndarray, np.ndarray]]  # by bone: frames (T,), and the largest sigma (T,) of its channels [degrees]
@@ -100,8 +103,7 @@ def _draw_strip() -> None:
     if found is None:
         return
     body, sigmas = found
-    chosen = {bone.name for bone in bpy.context.selected_pose_bones or ()} if body.mode == "POSE" else set()
-    frames, worst = of_frames(sigmas, chosen)
+    frames, worst = of_frames(sigmas, chosen_bones(body))
     height, to_region = STRIP_PX * bpy.context.preferences.system.ui_scale, region.view2d.view_to_region
     for frame, colour in zip(frames, colour_of(worst)):
         left, right = (to_region(frame + half, 0.0, clip=False)[0] for half in (-0.5, 0.5))
@@ -109,18 +111,29 @@ def _draw_strip() -> None:
             canvas.fill(canvas.rectangle(left, 0.0, max(right - left, 1.0), height), tuple(colour))
 
 
-def _draw_bones() -> None:
-    found = _shown()
-    if found is None or not bpy.context.space_data.overlay.show_overlays:
-        return
-    body, sigmas = found
-    if not body.visible_get():
-        return
-    frame, ends, sigma = bpy.context.scene.frame_current, [], []
-    for name, (frames, of_bone) in sigmas.items():
+def chosen_bones(body: bpy.types.Object) -> set[str]:
+    """The bones of a body that are selected in Pose Mode, or whose controls are."""
+    posed = [thing for thing in (body, standing.controls_of_body(body)) if thing is not None and thing.mode == "POSE"]
+    return {CONTROL.sub("", bone.name) for bone in bpy.context.selected_pose_bones or () if bone.id_data in posed}
+
+
+def bones_drawn(body: bpy.types.Object, sigmas: Sigmas, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (B, 2, 3) and sigmas (B,) of the bones that have one in a frame, which is shown; none if neither the body nor its control rig
+    is visible. The body's own bones lie within the controls, also while they are hidden."""
+    rig, ends, sigma = standing.controls_of_body(body), [], []
+    visible = body.visible_get() or (rig is not None and rig.visible_get())
+    for name, (frames, of_bone) in sigmas.items() if visible else ():
         bone, row = body.pose.bones.get(name), int(np.searchsorted(frames, frame))
         if bone is not None and row < len(frames) and frames[row] == frame and name != standing.ROOT:
             ends.append([body.matrix_world @ bone.head, body.matrix_world @ bone.tail])
             sigma.append(of_bone[row])
-    if ends:
-        canvas.draw_lines_in_space(np.array(ends), colour_of(np.array(sigma)), BONE_PX)
+    return np.array(ends).reshape(-1, 2, 3), np.array(sigma)
+
+
+def _draw_bones() -> None:
+    found = _shown()
+    if found is None or not bpy.context.space_data.overlay.show_overlays:
+        return
+    ends, sigma = bones_drawn(*found, bpy.context.scene.frame_current)
+    if len(ends):
+        canvas.draw_lines_in_space(ends, colour_of(sigma), BONE_PX)

@@ -1,10 +1,11 @@
-"""bpy.ops.tricap.make_control_rig(), bpy.ops.tricap.snap_limbs(to="IK", limbs="upper_arm.L, thigh.R")"""
+"""bpy.ops.tricap.make_control_rig(), bpy.ops.tricap.snap_limbs(to="IK", limbs="upper_arm.L, thigh.R", frames="PLAYED")"""
 
 import bpy
 
 from ...core.foundation.errors import InputError
 from ..panels import TellingOperator
-from ..retarget import control_rig
+from ..retarget import control_rig, snapping
+from ..retarget.playing import played_frames
 from ..scene import standing
 
 
@@ -40,7 +41,8 @@ class MakeControlRig(TellingOperator, bpy.types.Operator):
 
 
 class SnapLimbs(TellingOperator, bpy.types.Operator):
-    """Switch arms and legs between IK and FK in this frame, without moving the body. Auto Keying keys the controls"""
+    """Switch arms and legs between IK and FK without moving the body: in this frame, which Auto Keying keys while others stay as they are,
+    or with keys in all frames that are played"""
 
     bl_idname = "tricap.snap_limbs"
     bl_label = "Snap Limbs"
@@ -49,21 +51,39 @@ class SnapLimbs(TellingOperator, bpy.types.Operator):
     to: bpy.props.EnumProperty(name="To", items=[("IK", "IK", "Pose limbs by hand and foot"), ("FK", "FK", "Pose limbs by rotations")])  # type: ignore[valid-type]
     limbs: bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")  # type: ignore[valid-type]
 
+    frames: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Frames",
+        items=[
+            ("CURRENT", "This Frame", "In the current frame; with Auto Keying, with keys, so that other frames do not change"),
+            ("PLAYED", "Played Frames", "With keys in every frame of the preview range, or else of the scene"),
+        ],
+    )
+
     def do(self, context: bpy.types.Context) -> str:
         """Snap them."""
-        limbs = [limb.strip() for limb in self.limbs.split(",") if limb.strip()]
-        count = control_rig.snap(body_of(context), self.to, limbs)
-        return f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} now."
+        limbs, body = [limb.strip() for limb in self.limbs.split(",") if limb.strip()], body_of(context)
+        if self.frames == "PLAYED":
+            frames = played_frames(context.scene)
+            count, where = snapping.snap_frames(body, self.to, limbs, frames), f"in frames {frames.start}–{frames.stop - 1}"
+        else:
+            count, where = snapping.snap(body, self.to, limbs), "in this frame"
+            keyed = context.scene.tool_settings.use_keyframe_insert_auto
+            where += "; other frames are as before" if keyed else ", without keys: another frame shows what is keyed"
+        return f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} {where}."
 
 
 def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
     """The buttons of a body's control rig in step 7."""
-    if control_rig.rig_of(body) is None:
+    if standing.controls_of_body(body) is None:
         layout.operator("tricap.make_control_rig", icon="OUTLINER_OB_ARMATURE")
         return
     row = layout.row(align=True)
     for to in ("IK", "FK"):
         row.operator("tricap.snap_limbs", text=f"Snap to {to}", icon="SNAP_ON").to = to
+    row = layout.row(align=True)
+    for to in ("IK", "FK"):
+        button = row.operator("tricap.snap_limbs", text=f"Bake to {to}", icon="KEYINGSET")
+        button.to, button.frames = to, "PLAYED"
 
 
 CLASSES = (MakeControlRig, SnapLimbs)

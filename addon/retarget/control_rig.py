@@ -2,45 +2,33 @@
 
 The motion becomes keys of the FK controls, in an NLA strip under an empty action that adds corrections. Each bone of the body copies the
 transform of a bone of the control rig that is rigidly attached to the limb, whether IK or FK moves it; skin, metaballs and exports stay
-those of the body. With the rest rotations R_rest of body and control, and A from the control's rest direction to the body's,
-
-    R_control = R_body · R_body,restᵀ · A · R_control,rest                                                              (1)
+those of the body.
 """
 
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from math import atan2
-from typing import TYPE_CHECKING
 
 import addon_utils
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
+from mathutils import Matrix
 
 from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
-from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
-from ..scene import stored
+from ...core.motion.retarget.rig import Motion
+from ..editing import foot_lock
+from ..scene import excluded, stored
 from ..scene.armature import SNAPS_KEY
-from ..scene.standing import RIG_KEY, ROOT
+from ..scene.standing import RIG_KEY, ROOT, controls_of_body
 from . import metarig
+from .base_layer import CONSTRAINT, LOCKED_KEY, bake
+from .metarig import DRIVE
 from .playing import keyed_frames
-from .read import orthonormal, read_motion, read_rig, world_matrix
-from .write import push_to_strip, write_action
+from .read import read_motion, read_rig
+from .snapping import snaps_of
 
-if TYPE_CHECKING:
-    from ...core.motion.retarget.retarget import Retargeted
-
-CONSTRAINT = "Control rig"
-DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
-CORRECTIONS = "Corrections"
-TOE = "toe"
-LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
+STRETCH = "IK_Stretch"  # custom property of the bones with the switches of the limbs
+WIDGETS_KEY = "tricap_widgets"  # custom property of the collection with the shapes of the controls
 CHECKED_FRAMES = 25
-RESTING_RAD = 1e-4  # rotation of a finger or toe that does not leave its rest
-MOST_TURNS, SMALLEST_TURN_RAD = 6, 1e-5  # of the base of an IK limb, until its middle joint is where it was
-NEEDED = {"ctrl_bones", "tail_bones"}  # of the arguments of Rigify's snapping
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,36 +40,29 @@ class Made:
     place_mm: float
 
 
-def control_of(bone: str) -> str:
-    """The FK control of a bone of the body."""
-    part, _, side = bone.partition(".")
-    return f"{part}_fk.{side}" if any(part in chain for chain in metarig.LIMBS.values()) else bone
-
-
-def driven_bones(body: bpy.types.Object) -> tuple[str, ...]:
-    """The bones of a body, below its root, that copy those of a control rig."""
-    return (*metarig.needed_bones(), *metarig.digits_of(body))
-
-
 def make_control_rig(body: bpy.types.Object) -> Made:
     """Make the control rig of a body and let it drive the body. Main thread only.
 
     Raises:
         InputError: the body has one already, is no whole body, or Rigify cannot be used.
     """
-    if rig_of(body) is not None:
-        raise InputError(f"“{body.name}” has the control rig “{rig_of(body).name}” already; delete it first to make another.")
+    if controls_of_body(body) is not None:
+        raise InputError(f"“{body.name}” has the control rig “{controls_of_body(body).name}” already; delete it first to make another.")
     _release(body)
     frames = keyed_frames(body)
     motion = read_motion(body, read_rig(body), frames)
+    if foot_lock.is_active(body):  # the motion has it already; its constraints would act on top of the controls
+        foot_lock.activate(body, False)
+        body[LOCKED_KEY] = True
     rig = _generated(body)
     rig.matrix_world = body.matrix_world
     _add_drive_bones(rig, body)
     bpy.context.view_layer.update()
-    _key_controls(rig, body, motion)
+    _fix_lengths(rig)
+    bake(rig, body, motion)
     _drive(body, rig)
     body[RIG_KEY] = rig
-    rig[SNAPS_KEY] = _snaps(rig)
+    rig[SNAPS_KEY] = snaps_of(rig)
     _put_in_place_of(body, rig)
     return Made(rig=rig, **_deviation(body, motion))
 
@@ -97,17 +78,14 @@ def _put_in_place_of(body: bpy.types.Object, rig: bpy.types.Object) -> None:
     body.hide_set(True)
 
 
-def rig_of(body: bpy.types.Object) -> bpy.types.Object | None:
-    """The control rig of a body, if it has one."""
-    rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
-    return rig if rig is not None and rig.type == "ARMATURE" and rig.name in bpy.context.scene.objects else None
-
-
 def _release(body: bpy.types.Object) -> None:
-    """Let nothing drive the body that is left of a deleted control rig: constraints, and the rig itself, which the body's property kept."""
+    """Let nothing drive the body that is left of a deleted control rig: constraints, and the rig itself, which the body's property kept.
+    The foot lock acts again."""
     for bone in body.pose.bones:
         for constraint in [c for c in bone.constraints if c.name == CONSTRAINT]:
             bone.constraints.remove(constraint)
+    if body.pop(LOCKED_KEY, False):
+        foot_lock.activate(body, True)
     deleted = stored.data_block(body, RIG_KEY, bpy.types.Object)
     body.pop(RIG_KEY, None)
     if deleted is not None and not deleted.users_collection:
@@ -122,7 +100,7 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
     made = metarig.add_metarig(body, scene.collection)
     try:
         bpy.ops.pose.rigify_generate()
-        rig = made.data.rigify_target_rig
+        rig, widgets = made.data.rigify_target_rig, made.data.rigify_widgets_collection
     except RuntimeError as error:
         raise InputError(f"Rigify could not generate the controls: {str(error).strip()}") from error
     finally:
@@ -130,18 +108,38 @@ def _generated(body: bpy.types.Object) -> bpy.types.Object:
         bpy.data.objects.remove(made)
         bpy.data.armatures.remove(data)
     rig.name = rig.data.name = f"{body.name} controls"
+    _put_below(body.users_collection[0], widgets)
     for text in set(bpy.data.texts) - before:
         text.use_module = True  # as Rigify: the panel of the rig comes back with the file
     return rig
 
 
+def _fix_lengths(rig: bpy.types.Object) -> None:
+    """Let IK neither stretch a limb nor, as Blender's does too, shorten it: by 3 % in a bent leg, which FK cannot show."""
+    for bone in rig.pose.bones:
+        bone.ik_stretch = 0.0
+        if STRETCH in bone:
+            bone[STRETCH] = 0.0
+
+
+def _put_below(parent: bpy.types.Collection, widgets: bpy.types.Collection) -> None:
+    """Move the shapes of the controls below a collection; Rigify adds them to the user's active one. They stay excluded."""
+    scene = bpy.context.scene
+    for other in [scene.collection, *bpy.data.collections]:
+        if widgets in other.children.values():
+            other.children.unlink(widgets)
+    parent.children.link(widgets)
+    widgets[WIDGETS_KEY] = True
+    excluded.show(scene, WIDGETS_KEY, False)
+
+
 def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:
-    names, digits = driven_bones(body), metarig.digits_of(body)
+    names, digits = metarig.driven_bones(body), metarig.digits_of(body)
     unused = metarig.unused_bones(rig, body)
     for name in digits:
-        rig.pose.bones[control_of(name)].custom_shape_transform = None  # an unused bone
-        rig.pose.bones[control_of(name)].lock_location = (True, True, True)
-    rotation = {name: _bent(rig, body, name) for name in names}
+        rig.pose.bones[metarig.control_of(name)].custom_shape_transform = None  # an unused bone
+        rig.pose.bones[metarig.control_of(name)].lock_location = (True, True, True)
+    rotation = {name: metarig.bent(rig, body, name) for name in names}
     bpy.ops.object.select_all(action="DESELECT")
     bpy.context.view_layer.objects.active = rig
     rig.select_set(True)
@@ -151,7 +149,7 @@ def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:
         bones.remove(bones[name])
     for name in (ROOT, *names):
         bone, rest = bones.new(DRIVE + name), np.array(body.data.bones[name].matrix_local)
-        parent = bones[ROOT if name == ROOT else control_of(name) if name in digits else f"ORG-{name}"]
+        parent = bones[ROOT if name == ROOT else metarig.control_of(name) if name in digits else f"ORG-{name}"]
         bone.length, bone.parent, bone.use_deform = body.data.bones[name].length, parent, False
         matrix = np.eye(4)
         matrix[:3, :3] = rest[:3, :3] if name == ROOT else rotation[name].T @ rest[:3, :3]
@@ -164,83 +162,10 @@ def _add_drive_bones(rig: bpy.types.Object, body: bpy.types.Object) -> None:
         hidden.assign(rig.data.bones[DRIVE + name])
 
 
-def _bent(rig: bpy.types.Object, body: bpy.types.Object, name: str) -> np.ndarray:
-    return metarig.bent_rest(body, rig, name, f"ORG-{name}")
-
-
-def _key_controls(rig: bpy.types.Object, body: bpy.types.Object, motion: Motion) -> None:
-    """Write the motion as keys of root and FK controls, push them to an NLA strip, and begin an empty action over it."""
-    names = driven_bones(body)
-    follows = {control_of(name): control_of(_parent(name)) for name in names if name != "pelvis"} | {"pelvis": ROOT}
-    limbs = {f"{chain[0]}_parent.{side}": LIMB_PROPERTIES for chain in metarig.LIMBS.values() for side in "LR"}
-    chains = {name: (control_of(name),) for name in names} | {ROOT: (ROOT,)}
-    whole = read_rig(rig)
-    controls = controls_of(whole, ControlRig(follows=follows, properties=limbs), chains)
-    R, place = _targets(controls, body, rig, motion)
-    result = _result(controls, motion, R, place, {control_of(name) for name in metarig.digits_of(body)})
-    written = write_action(rig, result, "Measured motion", properties=limbs)
-    push_to_strip(rig, written.action)
-    rig.animation_data.nla_tracks[-1].lock = True
-    rig.animation_data.action = bpy.data.actions.new(CORRECTIONS)
-    rig.animation_data.action_blend_type, rig.animation_data.action_extrapolation = "COMBINE", "HOLD"
-
-
-def _parent(name: str) -> str:
-    """The parent of a bone of the body."""
-    part, _, side = name.partition(".")
-    if part == TOE:
-        return f"foot.{side}"
-    if part in metarig.FINGERS:  # side: "02.R"
-        number, _, side = side.partition(".")
-        return f"hand.{side}" if number == "01" else f"{part}.0{int(number) - 1}.{side}"
-    for limb, chain in metarig.LIMBS.items():
-        if part in chain[1:]:
-            return f"{chain[chain.index(part) - 1]}.{side}"
-        if part == chain[0]:
-            return "pelvis" if limb == "leg" else f"shoulder.{side}"
-    return metarig.PARENTS[part]
-
-
-def _targets(controls: Rig, body: bpy.types.Object, rig: bpy.types.Object, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations (T, B, 3, 3) and heads (T, B, 3) of the controls that place the body as in `motion`.  (1)"""
-    bone_of = {control_of(name): name for name in driven_bones(body)} | {ROOT: ROOT}
-    rows = [motion.rig.index[bone_of[control]] for control in controls.names]
-    since_rest = motion.R[:, rows] @ transposed(motion.rig.R_rest[rows])
-    A = np.array([np.eye(3) if control == ROOT else _bent(rig, body, bone_of[control]) for control in controls.names])
-    object_R = orthonormal(world_matrix(rig)[:3, :3])
-    return since_rest @ object_R @ A @ object_R.T @ controls.R_rest, motion.head_m[:, rows]
-
-
-def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray, digits: set[str]) -> "Retargeted":
-    """The root keeps to the floor under the person; the pelvis carries the rest. Fingers and toes (`digits`) that do not leave their rest
-    get no keys, so that a pose of the animator's stays in all frames."""
-    root, pelvis = controls.index[ROOT], controls.index["pelvis"]
-    path = place[:, root] - controls.head_m[root]
-    shift = place[:, pelvis] - (controls.head_m[pelvis] + path)
-    played = Motion(rig=controls, fps=motion.fps, frames=motion.frames, R=R, head_m=place)
-    from ...core.motion.retarget.retarget import Retargeted
-
-    basis = channels(controls, R)
-    resting = angle_of(basis).max(axis=0) < RESTING_RAD
-    return Retargeted(
-        motion=played,
-        basis=basis,
-        shift_m=shift,
-        carrier=pelvis,
-        loose_m={root: path},
-        driven=np.array([name not in digits or not rests for name, rests in zip(controls.names, resting)]),
-        scale=1.0,
-        roles=(),
-        contacts=None,
-        notes=(),
-        removed_travel_m=0.0 * path,
-    )
-
-
 def _drive(body: bpy.types.Object, rig: bpy.types.Object) -> None:
     """Let each bone of the body copy its bone of the control rig; fingers and toes, which begin at bones of the body, its rotation only."""
     digits = metarig.digits_of(body)
-    for name in (ROOT, *driven_bones(body)):
+    for name in (ROOT, *metarig.driven_bones(body)):
         constraint = body.pose.bones[name].constraints.new("COPY_ROTATION" if name in digits else "COPY_TRANSFORMS")
         constraint.name, constraint.target, constraint.subtarget = CONSTRAINT, rig, DRIVE + name
 
@@ -251,143 +176,3 @@ def _deviation(body: bpy.types.Object, before: Motion) -> dict[str, float]:
     turned = np.degrees(angle_of(transposed(now.R) @ before.R[some])).max()
     moved = 1e3 * np.linalg.norm(now.head_m - before.head_m[some], axis=-1).max()
     return {"angle_deg": float(turned), "place_mm": float(moved)}
-
-
-def _snaps(rig: bpy.types.Object) -> dict[str, dict[str, dict[str, str]]]:
-    """By limb and target ("IK", "FK"), the arguments of Rigify's snapping, from the script of the rig's panel."""
-    text = next(t.as_string() for t in bpy.data.texts if str(rig.data["rig_id"]) in t.as_string())
-    found: dict[str, dict[str, dict[str, str]]] = {}
-    kinds = {f"pose.rigify_generic_snap_{rig.data['rig_id']}": "FK", f"pose.rigify_limb_ik2fk_{rig.data['rig_id']}": "IK"}
-    for operator, lines in re.findall(r"operator\('(pose\.rigify_\w+)'[^\n]*\n((?:\s+props\.\w+ = '[^\n]*'\n)+)", text):
-        given = dict(re.findall(r"props\.(\w+) = '([^\n]*)'", lines))
-        chain = given.get("fk_bones") or given.get("output_bones", "")
-        if operator in kinds and "_fk." in chain:
-            found.setdefault(_names(chain)[0].replace("_fk", ""), {})[kinds[operator]] = given
-    return found
-
-
-def _names(listed: str) -> list[str]:
-    """The names in a list of Rigify: '["hand_ik.L", "foot_ik.L"]'."""
-    return re.findall(r'"([^"]+)"', listed)
-
-
-def snap(body: bpy.types.Object, to: str, limbs: Sequence[str] = ()) -> int:
-    """Let the IK controls of limbs take up the pose of FK, or the reverse, in the current frame, and switch to them; the number of limbs.
-
-    The body does not move: what a hinge of IK cannot do (the twist of a forearm) is stored in the bones that the body copies. With Auto
-    Keying, the controls are keyed. `to`: "IK" or "FK"; `limbs`: names such as "upper_arm.L", "thigh.R"; empty for all four.
-
-    Raises:
-        InputError: the body has no control rig, the rig is hidden, there is no such limb, or the script of the rig does not run.
-    """
-    rig = rig_of(body)
-    if rig is None:
-        raise InputError(f"“{body.name}” has no control rig; press Make Control Rig first.")
-    if not rig.visible_get():
-        raise InputError(f"The control rig “{rig.name}” is hidden; show it first.")
-    known = {name: row["IK"] for name, row in stored.rows(rig, SNAPS_KEY, IK=dict).items() if _is_limb(name) and NEEDED <= row["IK"].keys()}
-    if not known:
-        raise InputError(f"The limbs of the control rig “{rig.name}” are not stored in it; delete it, and make it again.")
-    unknown = [limb for limb in limbs if limb not in known]
-    if unknown:
-        raise InputError(f"There is no limb “{unknown[0]}”; choose among {', '.join(known)}.")
-    for limb in limbs or tuple(known):
-        (_snap_to_ik if to == "IK" else _snap_to_fk)(rig, body, limb, known[limb])
-        if bpy.context.scene.tool_settings.use_keyframe_insert_auto:
-            _key_limb(rig, limb, known[limb])
-    return len(limbs or known)
-
-
-def _is_limb(name: str) -> bool:
-    """Whether a name is that of the first bone of an arm or a leg."""
-    return name in {f"{chain[0]}.{side}" for chain in metarig.LIMBS.values() for side in "LR"}
-
-
-def _chain(limb: str) -> tuple[str, str, str]:
-    """The bones of the body in a limb."""
-    part, _, side = limb.partition(".")
-    first, second, third = next(chain for chain in metarig.LIMBS.values() if chain[0] == part)
-    return f"{first}.{side}", f"{second}.{side}", f"{third}.{side}"
-
-
-def _snap_to_ik(rig: bpy.types.Object, body: bpy.types.Object, limb: str, arguments: dict[str, str]) -> None:
-    chain, bones = _chain(limb), rig.pose.bones
-    wanted = {name: rig.matrix_world.inverted() @ body.matrix_world @ body.pose.bones[name].matrix for name in chain}
-    joint = bones[f"ORG-{chain[1]}"].head.copy()
-    _call_rigify(rig, f"rigify_limb_ik2fk_{rig.data['rig_id']}", arguments)
-    bones[_master(limb)]["IK_FK"] = 0.0
-    _update(rig)
-    base = bones[_names(arguments["ctrl_bones"])[0]]
-    for _ in range(MOST_TURNS):  # about the line from the limb's first to its last joint, until elbow or knee is where it was
-        first, now, last = (bones[f"ORG-{name}"].head for name in chain)
-        angle = _angle_about((last - first).normalized(), now - first, joint - first)
-        if abs(angle) < SMALLEST_TURN_RAD:
-            break
-        about = Matrix.Translation(first) @ Matrix.Rotation(angle, 4, last - first) @ Matrix.Translation(-first)
-        base.matrix = about @ base.matrix
-        _update(rig)
-    for name in chain:
-        bones[DRIVE + name].matrix = wanted[name]
-    _update(rig)
-
-
-def _snap_to_fk(rig: bpy.types.Object, body: bpy.types.Object, limb: str, _: dict[str, str]) -> None:
-    wanted = {name: rig.matrix_world.inverted() @ body.matrix_world @ body.pose.bones[name].matrix for name in _chain(limb)}
-    rig.pose.bones[_master(limb)]["IK_FK"] = 1.0
-    for name in _chain(limb):
-        drive, control = rig.pose.bones[DRIVE + name], rig.pose.bones[control_of(name)]
-        drive.matrix_basis = Matrix()
-        rest = drive.bone.matrix_local.to_3x3().inverted() @ control.bone.matrix_local.to_3x3()
-        control.matrix = Matrix.LocRotScale(control.head, (wanted[name].to_3x3() @ rest).to_quaternion(), None)
-        _update(rig)
-
-
-def _angle_about(axis: Vector, a: Vector, b: Vector) -> float:
-    """The angle about a unit axis from a to b, both seen along it."""
-    a, b = a - a.dot(axis) * axis, b - b.dot(axis) * axis
-    return atan2(axis.dot(a.cross(b)), a.dot(b))
-
-
-def _update(rig: bpy.types.Object) -> None:
-    rig.update_tag()
-    bpy.context.view_layer.update()
-
-
-def _call_rigify(rig: bpy.types.Object, name: str, arguments: dict[str, str]) -> None:
-    """Call an operator of the rig's own script.
-
-    Raises:
-        InputError: the script did not run.
-    """
-    layer, mode = bpy.context.view_layer, bpy.context.mode
-    active = layer.objects.active
-    if active is not None and mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-    layer.objects.active = rig
-    bpy.ops.object.mode_set(mode="POSE")
-    try:
-        getattr(bpy.ops.pose, name)(**arguments)
-    except (AttributeError, RuntimeError) as error:
-        message = "The script of the control rig does not run; allow Python scripts (Preferences, Save & Load) and reload."
-        raise InputError(message) from error
-    finally:
-        bpy.ops.object.mode_set(mode="OBJECT")
-        layer.objects.active = active
-        if mode == "POSE" and active is not None:
-            bpy.ops.object.mode_set(mode="POSE")
-
-
-def _key_limb(rig: bpy.types.Object, limb: str, arguments: dict[str, str]) -> None:
-    """Key the limb's controls, and its switch, in the current frame."""
-    controls = [*_names(arguments["ctrl_bones"]), *_names(arguments["tail_bones"]), *map(control_of, _chain(limb))]
-    for name in (*controls, *(DRIVE + name for name in _chain(limb))):
-        bone = rig.pose.bones[name]
-        channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode, "rotation_euler")
-        for path in ("location", channel):
-            bone.keyframe_insert(path, group=name)
-    rig.pose.bones[_master(limb)].keyframe_insert('["IK_FK"]', group=_master(limb))
-
-
-def _master(limb: str) -> str:
-    part, _, side = limb.partition(".")
-    return f"{part}_parent.{side}"

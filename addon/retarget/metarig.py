@@ -21,6 +21,13 @@ LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot
 FINGERS = ("thumb", "f_index", "f_middle", "f_ring", "f_pinky")  # of three bones: thumb.01.R to thumb.03.R
 PARENTS = {"spine": "pelvis", "chest": "spine", "neck": "chest", "head": "neck", "shoulder": "chest", "arm": "shoulder", "leg": "pelvis"}
 PREFIX = "Metarig of "
+DRIVE = "BODY-"  # prefix of the bones of a control rig that the body's bones copy
+
+
+def control_of(bone: str) -> str:
+    """The FK control of a bone of the body."""
+    part, _, side = bone.partition(".")
+    return f"{part}_fk.{side}" if any(part in chain for chain in LIMBS.values()) else bone
 
 
 def needed_bones() -> tuple[str, ...]:
@@ -38,6 +45,11 @@ def digits_of(body: bpy.types.Object) -> tuple[str, ...]:
     """The bones of a body's fingers and toes, parents first; none of a body without a modelled skin."""
     toes = [name for name in ("toe.L", "toe.R") if name in body.data.bones]
     return (*(name for side in "LR" for chain in fingers_of(body, side) for name in chain), *toes)
+
+
+def driven_bones(body: bpy.types.Object) -> tuple[str, ...]:
+    """The bones of a body, below its root, that copy those of a control rig."""
+    return (*needed_bones(), *digits_of(body))
 
 
 def unused_bones(rig: bpy.types.Object, body: bpy.types.Object) -> list[str]:
@@ -141,10 +153,10 @@ def _group(name: str) -> str:
     return f"{limb.capitalize()}{side}" if limb else "Torso"
 
 
-def bent_rest(body: bpy.types.Object, controls: bpy.types.Object, name: str, control: str) -> np.ndarray:
-    """A (3, 3): rotates the rest direction of a control to that of the body's bone, where the metarig moved the joint between two bones.
-    Other controls rotate as the body's bones, whatever their direction."""
+def bent(rig: bpy.types.Object, body: bpy.types.Object, name: str) -> np.ndarray:
+    """A (3, 3): rotates the rest direction of the control rig's bone to that of the body's, where the metarig moved the joint between two
+    bones. Other controls rotate as the body's bones, whatever their direction."""
     if not any(name[:-2] in chain[:2] for chain in LIMBS.values()):
         return np.eye(3)
-    here, there = (np.array(o.data.bones[bone].matrix_local)[:3, 1] for o, bone in ((body, name), (controls, control)))
+    here, there = (np.array(o.data.bones[bone].matrix_local)[:3, 1] for o, bone in ((body, name), (rig, f"ORG-{name}")))
     return np.array(Vector(there).rotation_difference(Vector(here)).to_matrix())

@@ -1,6 +1,6 @@
 """Writes a retargeted motion as an action of the target: all keys of an F-curve at once, in the bones' own rotation modes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import bpy
@@ -10,6 +10,9 @@ from ...core.geometry.rotation import continuous, euler_from_matrix, quaternion_
 from ...core.motion.retarget.residual_motion import ResidualMotion, to_text
 from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import needed_keys
+from ..editing.curves import replace_keys
+from ..scene.action import key
+from ..scene.standing import curves_of
 from .read import RESIDUAL_KEY, keys_digest, scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
@@ -73,19 +76,41 @@ def _new_action(
     target.animation_data.action = action
     frames, rig = result.motion.frames, result.motion.rig
     keys = 0
-    for b in np.flatnonzero(result.driven):
-        bone = target.pose.bones[rig.names[b]]
-        channel, values = rotation_values(bone, result.basis[:, b])
-        keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2)
+    turn = np.radians(tolerance_deg) / 2
+    shift = turn * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target)
+    for bone, channel, values in _driven_channels(target, result):
+        keep = needed_keys(frames, values, shift if channel == "location" else turn)
         keys += _key(action, target, f"{bone.path_from_id()}.{channel}", frames[keep], values[keep], bone.name)
-    shifts = dict(result.loose_m) | ({result.carrier: result.shift_m} if result.carrier >= 0 else {})
-    for b, shift_m in shifts.items():
-        bone = target.pose.bones[rig.names[b]]
-        values = location_values(target, bone, result, b, shift_m)
-        keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
-        keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
     keys += sum(_key(action, target, path, frames[:1], rest[None], bone) for bone, path, rest in resting)
     return action, keys + _key_properties(action, target, properties, frames[:1])
+
+
+def _driven_channels(target: bpy.types.Object, result: Retargeted) -> Iterator[tuple[bpy.types.PoseBone, str, np.ndarray]]:
+    """Bone, name and values (T, 3 or 4) of each channel that the motion drives."""
+    names = result.motion.rig.names
+    for b in np.flatnonzero(result.driven):
+        bone = target.pose.bones[names[b]]
+        yield bone, *rotation_values(bone, result.basis[:, b])
+    shifts = dict(result.loose_m) | ({result.carrier: result.shift_m} if result.carrier >= 0 else {})
+    for b, shift_m in shifts.items():
+        bone = target.pose.bones[names[b]]
+        yield bone, "location", location_values(target, bone, result, b, shift_m)
+
+
+def replace_frames(target: bpy.types.Object, action: bpy.types.Action, result: Retargeted) -> None:
+    """Put the motion into an action that `write_action` wrote, in the motion's own frames; the keys of other frames stay."""
+    curves, frames = {(curve.data_path, curve.array_index): curve for curve in curves_of(action)}, result.motion.frames
+    for bone, channel, values in _driven_channels(target, result):
+        own = [curves.get((f"{bone.path_from_id()}.{channel}", i)) for i in range(values.shape[1])]
+        if None in own:
+            continue
+        before = np.array([[curve.evaluate(frame) for curve in own] for frame in frames])
+        if channel == "rotation_quaternion":  # of the two that mean the same rotation, and so of angles, the one next to the neighbours
+            values = values * np.where((before * values).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        elif channel == "rotation_euler":
+            values = values + 2 * np.pi * np.round((before - values) / (2 * np.pi))
+        for curve, column in zip(own, values.T, strict=True):
+            replace_keys(curve, frames, column)
 
 
 def rotation_values(bone: bpy.types.PoseBone, basis: np.ndarray) -> tuple[str, np.ndarray]:
@@ -111,14 +136,8 @@ def location_values(target: bpy.types.Object, bone: bpy.types.PoseBone, result: 
 
 
 def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: np.ndarray, values: np.ndarray, group: str) -> int:
-    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
     for i in range(values.shape[1]):
-        curve = action.fcurve_ensure_for_datablock(owner, path, index=i)
-        points = curve.keyframe_points
-        points.add(len(frames))
-        points.foreach_set("co", np.stack([frames, values[:, i]], axis=1).astype(np.float32).ravel())
-        points.foreach_set("interpolation", np.full(len(frames), linear, dtype=np.int32))
-        curve.update()
+        key(action, owner, path, i, frames, values[:, i], group=group)
     return len(frames) * values.shape[1]
 
 
@@ -148,10 +167,10 @@ def _key_properties(
     keys = 0
     for name, values in properties.items():
         bone = target.pose.bones.get(name)
-        for key, value in values.items() if bone is not None else ():
-            if key in bone:
-                bone[key] = type(bone[key])(value)
-                path = f'{bone.path_from_id()}["{bpy.utils.escape_identifier(key)}"]'
+        for prop, value in values.items() if bone is not None else ():
+            if prop in bone:
+                bone[prop] = type(bone[prop])(value)
+                path = f'{bone.path_from_id()}["{bpy.utils.escape_identifier(prop)}"]'
                 keys += _key(action, target, path, at, np.full((1, 1), value), name)
     return keys
 

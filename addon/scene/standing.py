@@ -101,6 +101,12 @@ def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
     return (thing for thing in armatures if stored.number(thing.data, LIFT_KEY) is not None and ROOT in thing.data.bones)
 
 
+def controls_of_body(body: bpy.types.Object) -> bpy.types.Object | None:
+    """The control rig that drives a body, if it has one."""
+    rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
+    return rig if rig is not None and rig.type == "ARMATURE" and rig.name in bpy.context.scene.objects else None
+
+
 def dofs_of(body: bpy.types.Object) -> dict[str, dict[str, Any]]:
     """Bone, path and index of the channel of each degree of freedom of a body, as far as it has the bone."""
     found = stored.rows(body.data, DOFS_KEY, bone=str, path=str, index=int)
@@ -155,8 +161,8 @@ def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
         InputError: a control rig carries the body.
     """
     for body in bodies(scene):
-        rig = stored.data_block(body, RIG_KEY, bpy.types.Object)
-        if rig is not None and rig.name in scene.objects:
+        rig = controls_of_body(body)
+        if rig is not None:
             raise InputError(f"“{rig.name}” drives “{body.name}”; set the floor before the control rig is made, or delete that first.")
     scene[FLOOR_KEY] = height_m
     for body in bodies(scene):

@@ -14,7 +14,6 @@ from ..correcting.panel import draw_dofs
 from ..editing import operators as editing
 from ..operators import control_rig
 from ..panels import expanded, sentence
-from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
 from ..scene import excluded, footage_plane, layers, metaballs, standing
 from ..scene.options import POINTS_KEY
@@ -208,10 +207,10 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
     body = next(standing.bodies(context.scene), None)
     if body is not None:
         row = layout.row()
-        row.enabled = rig_of(body) is None  # a control rig carries the path itself
+        row.enabled = standing.controls_of_body(body) is None  # a control rig carries the path itself
         row.prop(context.scene.tricap, "path")
         row = layout.row()
-        row.enabled = rig_of(body) is None
+        row.enabled = standing.controls_of_body(body) is None
         row.prop(context.scene.tricap, "floor_m")
         control_rig.draw(layout, body)
     edited = next(standing.all_bodies(context.scene), None)

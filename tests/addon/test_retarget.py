@@ -105,6 +105,15 @@ def test_a_new_action_and_the_old_one_kept(empty: ModuleType) -> None:
     assert [tuple(point.co) for curve in curves(former) for point in curve.keyframe_points] == before
 
 
+def test_channels_are_grouped_by_their_bones(empty: ModuleType) -> None:
+    """As those of the body: in the Dope Sheet and the Graph Editor they fold into bones."""
+    target = armature(person(roll_seed=2), "Target")
+    outcome = onto(target, flail(person(), frames=4), tolerance_deg=1.0)
+    for action in (outcome.written.action, outcome.written.raw):
+        found = curves(action)
+        assert len(found) > 20 and not [c.data_path for c in found if c.group is None or c.group.name != c.data_path.split('"')[1]]
+
+
 def test_few_keys_and_all_of_them(empty: ModuleType) -> None:
     target = armature(person(roll_seed=2), "Target")
     target.pose.bones["head"].scale = (1.0, 2.0, 1.0)  # left from an earlier pose: both actions put it to rest
