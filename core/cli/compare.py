@@ -23,14 +23,14 @@ TRUTH = "Against the truth"  # group of measures
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Compare; the table's lines. Raises as `run_both`."""
     take: Path = args.take
-    folders = run_both(take, args.out, overrides(args.set), frame_range(args.frames), monitor, restart=args.restart)
+    folders, notes = run_both(take, args.out, overrides(args.set), frame_range(args.frames), monitor, restart=args.restart)
     measures = measures_of(folders, monitor)
     if (take / "truth.npz").is_file():
         measures = [*_of_truth(*(score_run(take, folder, monitor) for folder in folders)), *measures]
     write_comparison(args.out, take, folders, measures)
     if args.json:
         return [json.dumps(without_nan([as_row(m) for m in measures]), indent=1, ensure_ascii=False)]
-    return [*as_lines(measures), f"Page: {args.out / 'compare.html'}"]
+    return [*as_lines(measures), *(f"Note: {note}" for note in notes), f"Page: {args.out / 'compare.html'}"]
 
 
 def _of_truth(published: Score, default: Score) -> list[Measure]:

@@ -30,8 +30,8 @@ NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 def run_both(
     take: Path, out: Path, overrides: Overrides, frames: tuple[int, int] | None, monitor: Monitor, *, restart: bool = False
-) -> list[Path]:
-    """Run both methods; the folders of their results, in the order of `METHODS`.
+) -> tuple[list[Path], list[str]]:
+    """Run both methods; the folders of their results, in the order of `METHODS`, and what the user should know of them.
 
     Raises:
         InputError: see `pipeline.run`; or the overrides choose a preset, or one of the folders is a link out of `out`.
@@ -42,13 +42,15 @@ def run_both(
         check_inside(real_path(out) / method, real_path(out))
     if "preset" in overrides.get("method", {}):
         raise InputError("A comparison runs both presets; leave out --preset.")
+    notes = []
     for method in METHODS:
         with open_run(take, out / method, {**overrides, "method": {"preset": method}}, frames, restart=restart) as run:
             if not pipeline.is_complete(run):
                 monitor.begin(method)
                 run.close_ups = False  # the same part of the images in both reports
                 pipeline.all_stages(run, monitor)
-    return [out / method for method in METHODS]
+            notes += run.notes
+    return [out / method for method in METHODS], notes
 
 
 def measures_of(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:

@@ -15,6 +15,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
+from ..results import blend_file
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
@@ -40,6 +41,7 @@ class Run:
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
     body_key: str = ""  # that of the fit, whatever the skin
     record: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)  # what the user should know of the folder, and not of its results
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
@@ -122,6 +124,7 @@ def open_run(
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
     What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
+    A body.blend that somebody edited gets another name; `notes` has the sentence that says so, and so has an error that follows.
     `pictures`: the frames of the report's, by default a few.
 
     Raises:
@@ -140,15 +143,41 @@ def open_run(
     check_pictured(footage.frames, pictures)
     keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
     with Results(out).opened() as results:
-        if restart:
-            results.remove("run.json", "clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
+        notes = _remove_all(results) if restart else []
         before = {} if restart else results.read_run()
         record = new_record(footage, settings)
         kept, incomplete = valid_stages(before, keys, ignore_contours=ignore_contours), lost(results.folder, before)
         record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
+        record |= {name: before[name] for name in (blend_file.DIGESTS,) if name in before}
         if before:  # what was made otherwise must not stand beside the new
-            results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
-        yield Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+            notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
+        run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+        run.notes += notes
+        with _with_errors(run.notes):
+            yield run
+
+
+def _remove_all(results: Results) -> list[str]:
+    """Remove the results and checkpoints of earlier runs; see `_remove`. The cache comes last: it marks the folder as ours."""
+    return _remove(results, [blend_file.BLEND, "run.json", "clouds", *STAGE_FILES, "cache"])
+
+
+def _remove(results: Results, names: Sequence[str]) -> list[str]:
+    """Remove results. A body.blend with edits gets another name instead; the sentence that says so."""
+    kept = blend_file.keep_edited(results.folder) if blend_file.BLEND in names else ""
+    results.remove(*names)
+    return [kept] if kept else []
+
+
+@contextmanager
+def _with_errors(notes: Sequence[str]) -> Iterator[None]:
+    """Add the notes to an error or a stop: nobody else would show them then."""
+    try:
+        yield
+    except (InputError, Cancelled) as stop:
+        for note in notes:
+            stop.add_note(note)
+        raise
 
 
 def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
