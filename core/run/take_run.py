@@ -166,9 +166,9 @@ def open_run(
             notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
         run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
         run.notes, run.digests = notes, digests
-        if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
-            run.content_keys = by_content()
         with _with_errors(run.notes):
+            if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
+                run.content_keys = by_content()
             yield run
 
 
