@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..core.fitting.inputs.start_joints import NeedsClick
-from ..core.foundation.errors import InputError, sentence_of
+from ..core.foundation.errors import InputError, sentence_of, with_notes
 from ..core.foundation.progress import Cancelled, Monitor, time_text
 from ..core.foundation.threads import one_thread_in_linear_algebra
 from .alone import WaitingMonitor
@@ -315,7 +315,7 @@ class JobOperator:
         if (reason := sentence_of(error)) is not None:
             self.report({asked if isinstance(error, NeedsClick) else "ERROR"}, reason)  # type: ignore[attr-defined]
         elif isinstance(error, (Cancelled, KeyboardInterrupt)):
-            self.report({"WARNING"}, f"{error} {self.if_stopped}".strip())  # type: ignore[attr-defined]
+            self.report({"WARNING"}, f"{with_notes(error)} {self.if_stopped}".strip())  # type: ignore[attr-defined]
         else:
             log.error("A Tricap job failed.\n%s", job.trace)
             self.report({"ERROR"}, _message(error))  # type: ignore[attr-defined]

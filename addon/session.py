@@ -37,6 +37,7 @@ class FileState:
     step_ends: dict[tuple[str, str], Any] = field(default_factory=dict)  # by scene and step: how it failed or was stopped (StepEnd)
     take_problem: str = ""  # why the take of a scene built by the command is not shown
     sequences: "dict[tuple[Any, ...], ImageSequence]" = field(default_factory=dict)  # the opened footage, by file
+    digests: Any = None  # core.run.file_digests.FileDigests of the footage, once they were needed
     joints: dict[str, tuple[str, ...]] = field(default_factory=dict)  # those to click, by body model
     click_problems: dict[tuple[Any, ...], str] = field(default_factory=dict)  # by joint, clicks and cameras; "" where there is none
     mends: dict[str, Any] = field(default_factory=dict)  # by checked input: what its check found that a press mends (steps.check.Mends)

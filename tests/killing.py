@@ -264,6 +264,7 @@ def contents(out: Path) -> dict[str, bytes]:
             for stage in run["stages"].values():
                 stage.pop("seconds")
             run.get("files", {}).pop("report/report.html", None)
+            run.pop("blend", None)
             data = json.dumps(run).encode()
         elif name.startswith("report/") and path.suffix in (".html", ".json"):
             data = re.sub(rb'("?seconds"?: *)[0-9.e+-]+', rb"\1", data)

@@ -164,7 +164,9 @@ def open_sample(take: Path, again: bool, monitor: Monitor) -> "tuple[Path, TakeR
     if fitted and not again:
         monitor.begin("build")
         return take, run, read_contents(out, monitor)
-    return take, *measure(take, out, {}, True, monitor, restart=fitted)
+    computed, contents = measure(take, out, {}, True, monitor, restart=fitted)
+    computed.notes[:0] = run.notes
+    return take, computed, contents
 
 
 class Cancel(bpy.types.Operator):

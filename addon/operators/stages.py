@@ -85,7 +85,7 @@ def report_run(operator: Any, context: bpy.types.Context, run: "Run") -> None:
     context.scene.tricap.last = str(run)
     for sentence in notes_of(run.record):
         operator.report({"INFO"}, sentence)
-    for sentence in run.record["warnings"]:
+    for sentence in [*run.notes, *run.record["warnings"]]:
         operator.report({"WARNING"}, sentence)
     operator.report({"INFO"}, str(run))
 

@@ -121,7 +121,7 @@ def track_outline(take: Path, out: Path, overrides: Overrides, view: str, monito
 
     with open_run(take, out, overrides, ignore_contours=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
-        return write_contours(run, names, monitor, start)
+        return [*write_contours(run, names, monitor, start), *run.notes]
 
 
 CLASSES = (InspectPoints, FollowContours)

@@ -128,12 +128,12 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
         draw(args.blend.with_suffix(".png"), motion, source.map, armature_object, result.motion, target.rig_map)
         store.write_json(args.blend.with_suffix(".json"), table)
-    save_blend(args.blend)
+    kept = save_blend(args.blend)
     if args.json:
         import json
 
         return [json.dumps(table, indent=1, ensure_ascii=False)]
-    return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in outcome.notes)]
+    return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in [*outcome.notes, kept] if note)]
 
 
 def _check_replaceable_report(blend: Path) -> None:

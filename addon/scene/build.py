@@ -22,6 +22,7 @@ from ...core.foundation.bounded import real_path, real_place
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
+from ...core.results import blend_file
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
@@ -105,8 +106,8 @@ def write_scene(
     scene.frame_set(scene.frame_start)
     if bpy.app.background and (armature_object := next(standing.all_bodies(scene), None)) is not None:
         look_at(armature_object)
-    if blend is not None:
-        save_blend(Path(blend))
+    if blend is not None and (kept := save_blend(Path(blend))):
+        warnings.append(kept)
     return SceneReport(collection=collection.name, counts=counts, warnings=tuple(warnings), blend=blend)
 
 
@@ -199,9 +200,9 @@ def mark_doubtful(scene: bpy.types.Scene, stretches: Sequence[tuple[int, int, st
         scene.timeline_markers.new(f"{DOUBTFUL} {frames}: {reason}", frame=first)
 
 
-def save_blend(path: Path) -> None:
-    """Save a copy of the open file as `path`, completely or not at all; the open file keeps its name. An earlier file becomes .blend1,
-    unless it is the body.blend of a run.
+def save_blend(path: Path) -> str:
+    """Save a copy of the open file as `path`, completely or not at all; the open file keeps its name. An earlier file becomes .blend1;
+    only the body.blend of a run is replaced, unless it may have edits: then it gets another name. Returns the sentence that says so, or "".
 
     Raises:
         InputError: the file cannot be written.
@@ -211,12 +212,15 @@ def save_blend(path: Path) -> None:
         raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the Blender file another name.")
-    part = store.part_of(path)
+    part, kept, of_run = store.part_of(path), "", path.name == blend_file.BLEND and (path.parent / "run.json").exists()
     try:
         store.try_writing(part)
         with _relative_caches(path), unheard() if bpy.app.background else nullcontext():  # it tells the name of the partial file
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
-        if path.exists() and not (path.name == "body.blend" and (path.parent / "run.json").exists()):
+        if of_run:
+            kept = blend_file.keep_edited(path.parent)
+            blend_file.note_written(path.parent, part)
+        elif path.exists():
             os.replace(path, path.with_suffix(".blend1"))  # as Blender itself does
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
@@ -225,6 +229,7 @@ def save_blend(path: Path) -> None:
     finally:
         if part.exists():
             part.unlink()
+    return kept
 
 
 @contextmanager

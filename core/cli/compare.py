@@ -31,7 +31,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     write_comparison(args.out, take, halves, measures)
     if args.json:
         return [json.dumps(without_nan([as_row(m) for m in measures]), indent=1, ensure_ascii=False)]
-    return [*as_lines(measures), *halves.notes, f"Page: {args.out / 'compare.html'}"]
+    return [*as_lines(measures), *(f"Note: {note}" for note in halves.notes), f"Page: {args.out / 'compare.html'}"]
 
 
 def _of_truth(published: Score | None, default: Score) -> list[Measure]:

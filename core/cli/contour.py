@@ -31,7 +31,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if start.polygon is not None and not read_rig(take.rig_path)[args.view[0]].sees(start.polygon).any():
         raise InputError(f"The polygon {args.polygon} lies outside the image of view {args.view[0]}; write its pixels in the first frame.")
     with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), ignore_contours=True) as job:
-        return write_contours(job, args.view, monitor, start)
+        return [*write_contours(job, args.view, monitor, start), *job.notes]
 
 
 def _check_views(take: Take, views: list[str]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from ..foundation.errors import InputError, sentence_of
+from ..foundation.errors import InputError, sentence_of, with_notes
 from ..foundation.progress import Cancelled, Monitor, time_text
 from . import streams
 from .arguments import check_outputs, with_joined_frames
@@ -48,7 +48,7 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
         for line in lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", []):
             streams.write_line(line, sys.stdout)
     except Cancelled as stop:
-        streams.write_line(f"tricap: {stop}", sys.stderr)
+        streams.write_line(f"tricap: {with_notes(stop)}", sys.stderr)
         return 130
     except (InputError, OSError, MemoryError, ImportError, RuntimeError, cv2.error) as error:
         reason = sentence_of(error)

@@ -95,6 +95,7 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     lines, blend = _build_scene(job, args, monitor), out / "body.blend"
     return [
         str(job),
+        *(f"Note: {sentence}" for sentence in job.notes),
         *lines,
         *([] if blend.is_file() else [f"Note: {sentence}" for sentence in job.record["warnings"][-1:]]),
         "Compared with the truth of the recording:",
@@ -148,8 +149,9 @@ def _films(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> li
 
 def _summary(job: take_run.Run, as_json: bool) -> list[str]:
     if as_json:
-        return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
-    notes = [*notes_of(job.record), *job.record["warnings"]]
+        run = job.results.read_run()
+        return [json.dumps({**run, "warnings": [*run["warnings"], *job.notes]}, indent=1, ensure_ascii=False)]
+    notes = [*notes_of(job.record), *job.record["warnings"], *job.notes]
     return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in notes)]
 
 

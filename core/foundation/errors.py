@@ -29,9 +29,19 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} …"
 
 
+def with_notes(error: BaseException) -> str:
+    """The message of an error, and what was added to it on its way (`add_note`): what the user must also know."""
+    return " ".join([str(error), *getattr(error, "__notes__", ())])
+
+
 def sentence_of(error: BaseException) -> str | None:
     """What to tell the user at the edge of a command or job: of an InputError its message, of a fault of the system, of a disk or of memory
-    that no reader or writer expected a sentence with the file; None for a bug."""
+    that no reader or writer expected a sentence with the file; with its notes. None for a bug."""
+    reason = _sentence_of(error)
+    return None if reason is None else " ".join([reason, *getattr(error, "__notes__", ())])
+
+
+def _sentence_of(error: BaseException) -> str | None:
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError) and error.strerror:

@@ -51,6 +51,12 @@ def locked(folder: Path) -> Iterator[None]:
         _release(path, handle)
 
 
+def is_ours(folder: Path) -> bool:
+    """Whether the run that has locked a folder is this process, or the one that started it."""
+    owner = _owner(Path(folder) / NAME)
+    return owner.get("host") == platform.node() and owner.get("pid") in (os.getpid(), os.getppid())
+
+
 def _open(path: Path) -> int:
     """The handle of the lock file, locked, with this process as its owner."""
     while True:

@@ -3,6 +3,7 @@
 A file appears under its name only when it is complete: it is written under a temporary name and then renamed.
 """
 
+import errno
 import hashlib
 import io
 import json
@@ -10,8 +11,8 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -90,6 +91,28 @@ def try_writing(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     os.close(os.open(path, NEW_FILE, 0o666))
     path.unlink()
+
+
+def rename_to_free(path: Path, names: Iterable[Path]) -> Path:
+    """Rename a file to the first of the names in its folder that is free, and never over a file that has it by then; the new path.
+
+    Raises:
+        OSError: it cannot be renamed, or no name is free.
+    """
+    for free in names:
+        with suppress(FileExistsError):
+            try:
+                os.link(path, free)
+            except FileExistsError:
+                if not os.path.samefile(path, free):  # else a killed process did not come to the end
+                    raise
+            except OSError:  # a file system without second names
+                os.close(os.open(free, NEW_FILE))
+                os.replace(path, free)
+                return free
+            path.unlink()
+            return free
+    raise FileExistsError(errno.EEXIST, "no name is free", str(path))
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from ..foundation.errors import InputError
 FORMAT, VERSION = "tricap-run", 1
 FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
-    "reference_note": str, "files": dict,
+    "reference_note": str, "files": dict, "blend": list,
 }  # fmt: skip
 STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),
@@ -19,7 +19,7 @@ STAGE_FIGURES = {  # figures that a finished stage must have
 }
 SEEN = {"full": "the whole person is seen", "upper_body": "the images cut the person below"}  # why a model was chosen
 JOINTS = "it has the joints that are located"
-STAGE_WORDS = ("key", "not_done", "chosen_model")
+STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model")
 LARGEST_FIGURE = 1e12  # far above every figure of a run
 
 
@@ -59,7 +59,7 @@ def _invalid_table(run: Mapping[str, Any]) -> str | None:
     sizes = run.get("files", {}).values()
     if any(not isinstance(size, list) or len(size) != 2 or any(type(n) is not int for n in size) for size in sizes):
         return "files"
-    texts = {"inputs": run.get("inputs", {}).values(), "warnings": run.get("warnings", []), "views": run.get("views", [])}
+    texts = {"inputs": run.get("inputs", {}).values(), **{name: run.get(name, []) for name in ("warnings", "views", "blend")}}
     return next((name for name, values in texts.items() if any(not isinstance(v, str) for v in values)), None)
 
 

@@ -39,9 +39,10 @@ from ..take.footage import Footage, open_take
 from ..take.take import AUTO_BODY, FrameClicks, Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import read_trajectories
+from .file_digests import FileDigests
 from .record import FrameTable, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
-from .stages import stage_keys
+from .stages import CONTENT, Stamp, stage_keys, time_stamp
 
 FITTED_WITH = "fitted_with"  # entry of the fit in run.json: what the body was fitted with, see `fitted_with`
 MOST_CLOUDS = 64  # in memory: those of the background, and of one stretch
@@ -69,9 +70,14 @@ def fitted_with(footage: Footage, settings: Mapping[str, Any], out: Path) -> dic
         s.frame: {name: store.digest(repr(FrameClicks(joints={name: at}).table())) for name, at in s.joints.items()}
         for s in _clicked(footage)
     }
-    take = replace(footage.take, clicks=replace(footage.take.clicks, joints={}), keyframes=())
-    besides = stage_keys(replace(footage, take=take), settings, out)["fit"]
+    besides = besides_clicks(footage, settings, out, time_stamp)
     return {"besides": besides, "clicks": {str(frame): digests for frame, digests in sorted(clicks.items())}}
+
+
+def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp) -> str:
+    """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file."""
+    take = replace(footage.take, clicks=replace(footage.take.clicks, joints={}), keyframes=())
+    return stage_keys(replace(footage, take=take), settings, out, stamp)["fit"]
 
 
 def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monitor: Monitor) -> FittedAgain | None:
@@ -88,8 +94,12 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
     check_body(footage, settings["fitting"])
     with Results(out).opened() as results:
         record = results.read_run()
-        before, now = record.get("stages", {}).get("fit", {}).get(FITTED_WITH, {}), fitted_with(footage, settings, results.folder)
-        if before.get("besides") != now["besides"] or not results.path("skin", REST).is_file():
+        before = record.get("stages", {}).get("fit", {}).get(FITTED_WITH, {})
+        now = fitted_with(footage, settings, results.folder)
+        same = before.get("besides") == now["besides"] or (
+            CONTENT in before and before[CONTENT] == besides_clicks(footage, settings, results.folder, FileDigests().stamp)
+        )
+        if not same or not results.path("skin", REST).is_file():
             return None
         changed = _changed(before.get("clicks", {}), now["clicks"])
         if not changed:
@@ -104,7 +114,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
             parts.append(_fitted(footage, results, settings, body, rows, joints, monitor.part("fit", i, len(stretches))))
         _write(results, settings["skin"], body, parts)
         again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
-        record["stages"]["fit"] |= {FITTED_WITH: now, AGAIN: again}
+        record["stages"]["fit"] |= {FITTED_WITH: {**before, **now}, AGAIN: again}
         results.write_run(record)
     return FittedAgain(
         shape=body.shape,

@@ -25,6 +25,7 @@ from ..foundation import store
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
+from ..results import blend_file
 from ..results.folder import check_inside, check_separate_folder
 from . import pipeline, take_run
 from .engine import Engine, dask_client
@@ -132,7 +133,7 @@ def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[s
 
 def _summary_of(job: take_run.Run) -> str:
     """The run in one line, with its first warning and the number of further ones."""
-    warnings = job.record["warnings"]
+    warnings = [*job.notes, *job.record["warnings"]]
     more = f" ({len(warnings) - 1} more in the report)" if len(warnings) > 1 else ""
     return f"{job}. Warning: {warnings[0]}{more}" if warnings else str(job)
 
@@ -142,7 +143,9 @@ def _scene(job: take_run.Run) -> None:
     if importlib.util.find_spec("bpy") is None:
         return
     package = __name__.rpartition(".core.")[0]
-    blend = job.results.path("body.blend")
+    blend = job.results.path(blend_file.BLEND)
+    if kept := blend_file.keep_edited(job.results.folder):  # the child's sentences are not read
+        job.notes.append(kept)
     line = [sys.executable, "-P", "-m", package, "scene", str(job.results.folder), "--blend", str(blend), "--quiet"]
     done = subprocess.run(line, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": _search_path(package)})
     if done.returncode or not blend.is_file():

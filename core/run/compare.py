@@ -70,9 +70,10 @@ def run_both(
             published.pictured = _pictured(out / DEFAULT)
             _complete(published, PUBLISHED, monitor)
         except InputError as error:
-            return Halves(folders={DEFAULT: out / DEFAULT}, notes=(*note, f"The published method could not run: {error}"))
+            return Halves(folders={DEFAULT: out / DEFAULT}, notes=(*default.notes, *note, f"The published method could not run: {error}"))
         _alike((published, default), monitor)
-    return Halves(folders={method: out / method for method in METHODS}, notes=note)
+    notes = (*default.notes, *published.notes, *note)
+    return Halves(folders={method: out / method for method in METHODS}, notes=notes)
 
 
 def _remove_empty(folder: Path) -> None:

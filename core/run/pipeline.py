@@ -55,14 +55,14 @@ from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
-from .around_clicks import FITTED_WITH, fitted_with
+from .around_clicks import FITTED_WITH, besides_clicks, fitted_with
 from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .engine import Engine
 from .fitted_body import FittedBody, read_fitted, write_fitted
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
-from .stages import STAGES
+from .stages import CONTENT, STAGES
 from .take_run import Run, open_run
 from .workers import measure_at_once
 
@@ -144,7 +144,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         noted["chosen_model"] = given.model
     if tracked_again and (loop := loop_of(run.settings["fitting"], body.shape.skeleton)) != OFF:
         noted["closed_loop"] = loop
-    noted[FITTED_WITH] = fitted_with(run.footage, run.settings, run.results.folder)
+    given_to = run.footage, run.settings, run.results.folder
+    noted[FITTED_WITH] = {**fitted_with(*given_to), CONTENT: besides_clicks(*given_to, run.digests.stamp)}
     run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **noted)
 
 

@@ -2,7 +2,8 @@
 
 The key of a stage is a digest of everything that its result depends on, including the earlier stages. run.json stores the key with which
 each stage ran; a stage is stale when its current key differs. Footage enters a key by file names, sizes and modification times (an
-export of the same size is another file); checkpoints compare its content.
+export of the same size is another file). Because a copy of a project has other times, run.json also stores each key with the content of
+the files in place of their times: where only these differ, the stage is done (`known_keys`). Checkpoints compare the content, too.
 """
 
 import json
@@ -25,43 +26,48 @@ from ..tracking import track
 STAGES = ("measure", "track", "fit")
 
 
+Stamp = Callable[[Path], tuple[str, int, int | str]]  # name, size, and time of modification or digest of a file
+CONTENT = "content"  # of a stage in run.json: its key, with the content of files
+STAMPED = "stamped"  # the key, with times, of a copy of these files that was found to be the same
+
+
 @dataclass(frozen=True, kw_only=True)
 class StageInput:
     """The inputs and files of a stage that no earlier stage has."""
 
     settings: tuple[str, ...]  # groups of knobs
-    take: Callable[[Footage], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
+    take: Callable[[Footage, Stamp], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
     files: tuple[str, ...]  # results in OUT, which a run removes once they are stale
 
 
-def _measure_input(footage: Footage) -> Any:
+def _measure_input(footage: Footage, stamp: Stamp) -> Any:
     """The images, the cameras, and the person's masks."""
     take = footage.take
     regions = [c for c in _corrections(take) if c[0] == "region"]
-    views = [(v.name, v.offset_frames, *v.clock, *_timestamps(take, v)) for v in take.views]
-    files = [[_stamp(path) for path in s.files()] for s in footage.sequences]
+    views = [(v.name, v.offset_frames, *v.clock, *_timestamps(take, v, stamp)) for v in take.views]
+    files = [[stamp(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
-    person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
+    person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v, stamp)) for v in take.views]
     swept: tuple[float | str, ...] = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
     swept += footage.unlike_views
     return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, starts.ALGORITHM, *swept
 
 
-def _timestamps(take: Take, view: View) -> tuple[Any, ...]:
-    return () if view.timestamps is None else (_stamp(take.folder / view.timestamps),)
+def _timestamps(take: Take, view: View, stamp: Stamp) -> tuple[Any, ...]:
+    return () if view.timestamps is None else (stamp(take.folder / view.timestamps),)
 
 
-def _person_files(take: Take, view: View) -> Any:
+def _person_files(take: Take, view: View, stamp: Stamp) -> Any:
     pattern = view.mask or view.masks or view.background
-    return [_stamp(path) for path in sorted(bounded.matching(take.folder, pattern))] if pattern else []
+    return [stamp(path) for path in sorted(bounded.matching(take.folder, pattern))] if pattern else []
 
 
-def _track_input(footage: Footage) -> Any:
+def _track_input(footage: Footage, stamp: Stamp) -> Any:
     return footage.take.fps, [c for c in _corrections(footage.take) if c[0] == "trajectory"], track.ALGORITHM
 
 
-def _fit_input(footage: Footage) -> Any:
+def _fit_input(footage: Footage, stamp: Stamp) -> Any:
     take = footage.take
     model = take.body_model or NO_BODY
     own = store.digest(*model_files(model)) if model.endswith(".toml") else ""
@@ -72,7 +78,7 @@ def _fit_input(footage: Footage) -> Any:
         tuple(sorted(take.locked)),
         sorted(take.limits.items()),
         [_clicked(k) for k in take.keyframes],
-        _keypoints(take),
+        _keypoints(take, stamp),
         ALGORITHM,
     )
 
@@ -91,9 +97,15 @@ WITHOUT_STAGE = ("method", "contour", "key_points")
 STAGE_FILES = tuple(name for own in STAGE_INPUTS.values() for name in own.files)
 
 
-def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
+def time_stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
+    state = path.stat()
+    return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
+
+
+def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp = time_stamp) -> dict[str, str]:
     """The key of every stage, for opened footage, the settings of a run, and the contours in its folder OUT, whose digest is the
-    second word of the fit's key.
+    second word of the fit's key. `stamp`: what stands for a file.
 
     Raises:
         InputError: footage, rig or model are missing.
@@ -101,13 +113,36 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
     keys, before = {}, ""
     try:
         for stage, own in STAGE_INPUTS.items():
-            inputs = [settings[name] for name in own.settings], own.take(footage)
+            inputs = [settings[name] for name in own.settings], own.take(footage, stamp)
             before = keys[stage] = store.digest(before, repr(inputs))
         contours = sorted((out / "contours").glob("*.csv"))
         keys["fit"] += f" {store.digest(*contours, largest=bounded.TABLE_BYTES)}" if contours else ""
     except OSError as error:
         raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
     return keys
+
+
+def known_keys(keys: Mapping[str, str], run: Mapping[str, Any], content: Callable[[], Mapping[str, str]]) -> dict[str, str]:
+    """The keys, where only the times of files differ from those in a run.json with the key there. `content`: the keys by the content of
+    files, of none or all stages; it is called only where the answer depends on it. Results of earlier versions have no such keys."""
+    known, by_content = dict(keys), None
+    for stage, entry in run.get("stages", {}).items():
+        (now, contours), then = _words(keys.get(stage, "")), _words(entry.get("key", ""))[0]
+        if stage not in keys or now == then or not entry.get(CONTENT):
+            continue
+        same = now == _words(entry.get(STAMPED, ""))[0]
+        if not same:
+            by_content = content() if by_content is None else by_content
+            same = _words(by_content.get(stage, ""))[0] == _words(entry[CONTENT])[0]
+        if same:
+            known[stage] = f"{then} {contours}".rstrip()
+    return known
+
+
+def _words(key: str) -> tuple[str, str]:
+    """A key without the digest of the contours, and this digest."""
+    own, _, contours = key.partition(" ")
+    return own, contours
 
 
 def command_of(footage: Footage, settings: Mapping[str, Any]) -> str:
@@ -137,7 +172,7 @@ def valid_stages(run: Mapping[str, Any], keys: Mapping[str, str], *, ignore_cont
 
     def is_valid(name: str, entry: Mapping[str, Any]) -> bool:
         key, now = str(entry.get("key", "")), keys.get(name, "")
-        return bool(key) and (key == now or (ignore_contours and key.partition(" ")[0] == now.partition(" ")[0]))
+        return bool(key) and (key == now or (ignore_contours and _words(key)[0] == _words(now)[0]))
 
     valid = {name: entry for name, entry in stages.items() if is_valid(name, entry)}
     if "fit" not in valid and "tracked_again" in stages.get("fit", {}):
@@ -145,14 +180,8 @@ def valid_stages(run: Mapping[str, Any], keys: Mapping[str, str], *, ignore_cont
     return valid
 
 
-def _stamp(path: Path) -> tuple[str, int, int]:
-    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
-    state = path.stat()
-    return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
-
-
-def _keypoints(take: Take) -> Any:
-    return [(repr(s), [_stamp(path) for path in sorted(bounded.matching(take.folder, s.files))]) for s in take.keypoints]
+def _keypoints(take: Take, stamp: Stamp) -> Any:
+    return [(repr(s), [stamp(path) for path in sorted(bounded.matching(take.folder, s.files))]) for s in take.keypoints]
 
 
 def _clicked(clicks: FrameClicks) -> Any:

@@ -11,10 +11,12 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
+from ..results import blend_file
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
@@ -25,9 +27,10 @@ from ..take.take import Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import Trajectories
 from .engine import Engine
+from .file_digests import FileDigests
 from .record import frame_table, new_record, write_frame_table
 from .settings import Overrides, settings_of
-from .stages import STAGE_FILES, STAGE_INPUTS, stage_keys, valid_stages
+from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_keys, stage_keys, valid_stages
 
 
 @dataclass(kw_only=True)
@@ -38,8 +41,11 @@ class Run:
     settings: dict[str, Any]
     results: Results
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
+    content_keys: Mapping[str, str] = field(default_factory=dict)  # by the content of files in place of their times, where it was read
     body_key: str = ""  # that of the fit, whatever the skin
+    digests: FileDigests = field(default_factory=FileDigests)
     record: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)  # what the user should know of the folder, and not of its results
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
@@ -75,7 +81,11 @@ class Run:
     def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
-        stages = self.record["stages"] | {stage: {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}}
+        before = self.record["stages"].get(stage, {})
+        same = {name: before[name] for name in (CONTENT, STAMPED) if name in before and before.get("key") == key}
+        by_content = {CONTENT: self.content_keys[stage]} if stage in self.content_keys else {}
+        entry = {"seconds": round(time.perf_counter() - began, 2), "key": key, **same, **by_content, **figures}
+        stages = self.record["stages"] | {stage: entry}
         self.record["stages"] = {name: stages[name] for name in MADE_BY if name in stages}  # one made again is no longer the last
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
         self.results.write_run(self.record)
@@ -124,6 +134,7 @@ def open_run(
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
     What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
+    A body.blend that somebody edited gets another name; `notes` has the sentence that says so, and so has an error that follows.
     `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
 
     Raises:
@@ -143,15 +154,59 @@ def open_run(
     check_pictured(footage.frames, pictures)
     keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
     with Results(out).opened() as results:
-        if restart:
-            results.remove("run.json", "clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
-        before = {} if restart else results.read_run()
+        notes = _remove_all(results) if restart else []
+        before, digests = {} if restart else results.read_run(), FileDigests()
+
+        def by_content() -> dict[str, str]:
+            return stage_keys(footage, settings, Path(out), digests.stamp)
+
+        keys = _known(results, before, keys, by_content)
         record = new_record(footage, settings)
         kept, incomplete = valid_stages(before, keys, ignore_contours=ignore_contours), lost(results.folder, before)
         record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
+        record |= {name: before[name] for name in (blend_file.DIGESTS,) if name in before}
         if before:  # what was made otherwise must not stand beside the new
-            results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
-        yield Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+            notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
+        run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+        run.notes, run.digests = notes, digests
+        with _with_errors(run.notes):
+            if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
+                run.content_keys = by_content()
+            yield run
+
+
+def _known(results: Results, run: dict[str, Any], keys: dict[str, str], by_content: Callable[[], dict[str, str]]) -> dict[str, str]:
+    """`known_keys`; a copy of the files that is found to be the same is noted in run.json, so that its content is read only once."""
+    known = known_keys(keys, run, by_content)
+    found = [stage for stage in known if known[stage] != keys[stage] and run["stages"][stage].get(STAMPED) != keys[stage]]
+    for stage in found:
+        run["stages"][stage][STAMPED] = keys[stage]
+    if found:
+        store.write_json(results.path("run.json"), run)
+    return known
+
+
+def _remove_all(results: Results) -> list[str]:
+    """Remove the results and checkpoints of earlier runs; see `_remove`. The cache comes last: it marks the folder as ours."""
+    return _remove(results, [blend_file.BLEND, "run.json", "clouds", *STAGE_FILES, "cache"])
+
+
+def _remove(results: Results, names: Sequence[str]) -> list[str]:
+    """Remove results. A body.blend with edits gets another name instead; the sentence that says so."""
+    kept = blend_file.keep_edited(results.folder) if blend_file.BLEND in names else ""
+    results.remove(*names)
+    return [kept] if kept else []
+
+
+@contextmanager
+def _with_errors(notes: Sequence[str]) -> Iterator[None]:
+    """Add the notes to an error or a stop: nobody else would show them then."""
+    try:
+        yield
+    except (InputError, Cancelled) as stop:
+        for note in notes:
+            stop.add_note(note)
+        raise
 
 
 def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:

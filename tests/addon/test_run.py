@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tricap.core.results.folder import Results
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
@@ -49,6 +50,25 @@ def test_a_run_of_all_steps_reports_its_warnings(
     monkeypatch.setattr(pipeline, "all_stages", warned)
     assert blender.ops.tricap.run(take=str(take), out=str(tmp_path / "out"), build=False) == {"FINISHED"}
     assert "Warning: The rays miss each other by 9 px." in capfd.readouterr().out.splitlines()
+
+
+def test_a_run_keeps_a_scene_that_somebody_edited_and_says_so(
+    blender: ModuleType, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also one that is open here: it stays open, and is saved under its own name again."""
+    from bl_ext.user_default.tricap.core.run import pipeline
+
+    monkeypatch.setattr(pipeline, "all_stages", lambda *_: None)
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    out, given = tmp_path / "out", {"take": str(take), "out": str(tmp_path / "out")}
+    Results(out).write_run({})  # of other input
+    for name in ("body (edited).blend", "body (edited 2).blend"):
+        blender.ops.wm.save_as_mainfile(filepath=str(out / "body.blend"))
+        edited = (out / "body.blend").read_bytes()
+        assert blender.ops.tricap.run(**given, build=False) == {"FINISHED"}
+        assert (out / name).read_bytes() == edited and not (out / "body.blend").exists()
+        assert f"Warning: {out / 'body.blend'} may have edits of yours and is kept as “{name}”." in capfd.readouterr().out.splitlines()
+        assert blender.data.filepath == str(out / "body.blend")
 
 
 def test_the_output_folder_is_chosen_beside_the_file_or_the_take(blender: ModuleType, take: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -187,7 +188,7 @@ def test_a_place_that_cannot_be_written_is_told(empty: ModuleType, small_run: Sm
 
 
 def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
-    """It may be the user's own, with clicks in it; only a run's body.blend is replaced."""
+    """It may be the user's own, with clicks in it; only a run's body.blend is replaced, as long as nobody saved it."""
     from tricap.addon.scene.build import save_blend
 
     for name in ("mine.blend", "body.blend"):
@@ -199,9 +200,36 @@ def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, sma
     with pytest.raises(InputError, match="folder.blend is a folder"):
         save_blend(tmp_path / "folder.blend")
     assert (tmp_path / "folder.blend").is_dir()
-    (tmp_path / "run.json").write_text("{}")
+    shutil.copy(small_run.out / "run.json", tmp_path)
     save_blend(tmp_path / "body.blend")
-    assert not list(tmp_path.glob("*.blend1"))
+    assert not list(tmp_path.glob("*.blend1")) and (tmp_path / "body (edited).blend").exists(), "nobody noted who wrote the one before"
+    assert save_blend(tmp_path / "body.blend") == "" and len(list(tmp_path.glob("body*.blend"))) == 2
+
+
+def test_edits_in_the_scene_of_a_run_are_kept(blender: ModuleType, empty: ModuleType, small_run: SmallRun) -> None:
+    """Keyed, saved in Blender, and built again: by the command, from the open file itself, and with the button."""
+    from tricap.addon.scene.build import build_scene
+
+    out = small_run.out
+    assert not [w for w in build_scene(out, out / "body.blend").warnings if "edits" in w]
+    for n, name in enumerate(("body (edited).blend", "body (edited 2).blend", "body (edited 3).blend")):
+        empty.ops.wm.open_mainfile(filepath=str(out / "body.blend"))
+        body = next(o for o in empty.data.objects if o.type == "ARMATURE")
+        body["my_edit"] = n
+        empty.ops.wm.save_mainfile()
+        edited, said = (out / "body.blend").read_bytes(), f"{out / 'body.blend'} may have edits of yours and is kept as “{name}”."
+        if n == 0:
+            line = [sys.executable, "-m", "tricap", "scene", str(out), "--blend", str(out / "body.blend")]
+            done = subprocess.run(line, capture_output=True, text=True, timeout=120)
+            assert done.returncode == 0 and done.stdout.splitlines()[0] == said, done.stdout + done.stderr
+        elif n == 1:
+            assert build_scene(out, out / "body.blend").warnings[-1] == said
+        else:
+            assert blender.ops.tricap.build_scene(out=str(out), blend=str(out / "body.blend")) == {"FINISHED"}
+        assert (out / name).read_bytes() == edited and (out / "body.blend").read_bytes() != edited
+    empty.ops.wm.open_mainfile(filepath=str(out / "body (edited 2).blend"))
+    assert next(o for o in empty.data.objects if o.type == "ARMATURE")["my_edit"] == 1
+    assert len(list(out.glob("*.blend"))) == 4
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")

@@ -267,13 +267,32 @@ def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any
     run = (tmp_path / "out" / "run.json").stat().st_mtime_ns
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "run.json").stat().st_mtime_ns == run
     image = tmp_path / "take" / "C" / "0001.png"
-    written = image.stat().st_mtime_ns
-    os.utime(image, ns=(written, written + 3_000_000_000))  # exported anew
+    written, content = image.stat().st_mtime_ns, image.read_bytes()
+    os.utime(image, ns=(written, written + 3_000_000_000))  # as a copy of the project has it
+    assert words().split()[3:7] == ["done", "done", "done", "done"]
+    image.write_bytes(content[:-20] + bytes(20))  # another one of the same size
+    os.utime(image, ns=(written, written + 6_000_000_000))
     assert words().split()[3:7] == ["stale", "stale", "stale", "stale"]
+    image.write_bytes(content)
     os.utime(image, ns=(written, written))
     (tmp_path / "out" / "motion.csv").unlink()
     assert words().split()[5] == "ready"
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "motion.csv").exists()
+
+
+def test_a_copy_of_large_footage_is_read_by_the_next_run(
+    blender: ModuleType, done: Any, words: Words, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by the panel, which would stand still meanwhile."""
+    from bl_ext.user_default.tricap.addon.steps import states
+
+    monkeypatch.setattr(states, "MOST_READ", 1000)
+    image = tmp_path / "take" / "C" / "0001.png"
+    os.utime(image, ns=(1, image.stat().st_mtime_ns + 3_000_000_000))
+    assert words().split()[3:7] == ["stale", "stale", "stale", "stale"]
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.ply")}
+    assert blender.ops.tricap.run() == {"FINISHED"} and words().split()[3:7] == ["done", "done", "done", "done"]
+    assert files == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.ply")}
 
 
 def test_objects_and_clips_that_the_user_deleted_or_renamed(blender: ModuleType, done: Any, words: Words, why: Any) -> None:

@@ -92,6 +92,7 @@ def test_run_json(tmp_path: Path) -> None:
     ("stages", [], "stages"), ("stages", {"measure": 1}, "measure"), ("stages", {"track": {"key": 3}}, "track"), ("frames", [0], "frames"),
     ("stages", {"track": {"trajectories": "many", "mean_length_frames": 2.0}}, "track"), ("frames", [3, 1], "frames"),
     ("stages", {"fit": {"joint_sigma_mm": None}}, "fit"), ("stages", {"fit": {"joint_sigma_mm": 1.0, "frames": [3]}}, "fit"),
+    ("blend", [1], "blend"), ("blend", "x", "blend"),
     ("stages", {"fit": {"joint_sigma_mm": 10**18}}, "fit"), ("settings", [], "settings"), ("settings", {"skin": 3}, "settings"),
     ("warnings", [1], "warnings"), ("inputs", {"rig.toml": 5}, "inputs"), ("views", "LCR", "views"), ("take", None, "take"),
 ])  # fmt: skip

@@ -1,6 +1,7 @@
 """A finished body, here that of the sample, fitted again around new clicks."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import read_rig
 from tricap.core.motion.tables import read_joints
-from tricap.core.run.around_clicks import FITTED_WITH, fit_around_clicks, fitted_with
+from tricap.core.run.around_clicks import FITTED_WITH, besides_clicks, fit_around_clicks, fitted_with
+from tricap.core.run.file_digests import FileDigests
 from tricap.core.run.settings import settings_of
+from tricap.core.run.stages import CONTENT
 from tricap.core.synthetic.sample import unpack
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
@@ -30,7 +33,9 @@ def sample(tmp_path: Path) -> Path:
     run = json.loads(file.read_text())
     opened = read_take(take)
     settings = settings_of(opened.settings, {}, "take.toml")
-    run["stages"]["fit"] |= {FITTED_WITH: fitted_with(open_take(opened), settings, file.parent), "chosen_model": "full"}
+    given = open_take(opened), settings, file.parent
+    with_content = {**fitted_with(*given), CONTENT: besides_clicks(*given, FileDigests().stamp)}
+    run["stages"]["fit"] |= {FITTED_WITH: with_content, "chosen_model": "full"}
     file.write_text(json.dumps(run))
     place = read_joints(take / "results" / "joints.csv").joints_m["wrist.R"][FRAME] + SHIFT_M
     at = ", ".join(f"{c.name} = {c.project(place[None])[0].round(2).tolist()}" for c in read_rig(take / "rig.toml").cameras)
@@ -47,6 +52,20 @@ def test_a_body_that_was_chosen_automatically(sample: Path) -> None:
     after = read_joints(out / "joints.csv").joints_m
     assert (after["wrist.R"] - before["wrist.R"])[FRAME] @ SHIFT_M > 0.3 * SHIFT_M @ SHIFT_M, "towards the click"
     assert np.abs(after["wrist.L"] - before["wrist.L"]).max() < 1e-4, "the other arm stays"
+
+
+def test_images_with_other_times_need_no_whole_fit_and_other_images_do(sample: Path) -> None:
+    """The first are those of a copied project."""
+    out, image = sample / "results", next(iter(sorted((sample / "C").iterdir())))
+    os.utime(image, ns=(0, image.stat().st_mtime_ns + 5_000_000_000))
+    assert fit_around_clicks(sample, out, {}, Monitor()) is not None
+    with pytest.raises(InputError, match="No joints were clicked or pulled since"):
+        fit_around_clicks(sample, out, {}, Monitor())
+    content, time = bytearray(image.read_bytes()), image.stat().st_mtime_ns
+    content[-1] ^= 1
+    image.write_bytes(content)
+    os.utime(image, ns=(0, time + 5_000_000_000))
+    assert fit_around_clicks(sample, out, {}, Monitor()) is None
 
 
 def test_a_body_that_is_not_ours_is_not_read(sample: Path) -> None:

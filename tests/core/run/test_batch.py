@@ -125,7 +125,7 @@ def test_the_scene_is_built_by_this_package_and_its_absence_is_reported(tmp_path
     monkeypatch.chdir(tmp_path)
     warnings, results = list[str](), tmp_path / "results"
     folder = SimpleNamespace(folder=results, path=results.joinpath, write_run=lambda record: None)
-    job = SimpleNamespace(results=folder, record={}, warn=warnings.append)
+    job = SimpleNamespace(results=folder, record={}, warn=warnings.append, notes=[])
     batch._scene(job)
     assert not (tmp_path / "stranger ran").exists() and len(warnings) == 1 and str(results) in warnings[0], warnings
     monkeypatch.setattr(batch.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0, stderr=""))
@@ -142,7 +142,7 @@ def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, thread
 
 
 def test_what_is_doubtful_stands_in_the_summary() -> None:
-    job = SimpleNamespace(record={"warnings": []}, __str__=lambda: "")
+    job = SimpleNamespace(record={"warnings": []}, notes=[], __str__=lambda: "")
     assert batch._summary_of(job) == str(job)
     job.record["warnings"] = ["View R stood still.", "Another.", "A third."]
     assert batch._summary_of(job).endswith(". Warning: View R stood still. (2 more in the report)")

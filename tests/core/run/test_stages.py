@@ -6,12 +6,28 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from tricap.core.cli import main
 from tricap.core.foundation import store
+from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
-from tricap.core.run import take_run
-from tricap.core.run.stages import STAGE_INPUTS, STAGES, WITHOUT_STAGE, stage_keys, stage_of, valid_stages
+from tricap.core.run.file_digests import FileDigests
+from tricap.core.run.stages import (
+    CONTENT,
+    STAGE_INPUTS,
+    STAGES,
+    STAMPED,
+    WITHOUT_STAGE,
+    Stamp,
+    known_keys,
+    stage_keys,
+    stage_of,
+    time_stamp,
+    valid_stages,
+)
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import Take
 from tricap.core.take.writing import read_table, take_of_table
@@ -27,10 +43,10 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_take(folder, three_cameras(), [[Body()]] * 4)
 
 
-def keys(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> dict[str, str]:
+def keys(folder: Path, overrides: dict[str, Any] | None = None, stamp: Stamp = time_stamp, **changes: Any) -> dict[str, str]:
     table = read_table(folder) | {"seeds": {"frame": 1, "joints": JOINTS}, "body": {"model": "arm.R"}} | changes
     take = take_of_table(folder, table)
-    return stage_keys(open_take(take), take_run.settings_of(take.settings, overrides or {}, "the test"), folder / "out")
+    return stage_keys(open_take(take), take_run.settings_of(take.settings, overrides or {}, "the test"), folder / "out", stamp)
 
 
 def stale(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> list[str]:
@@ -111,6 +127,110 @@ def test_footage_exported_again_with_the_same_size_concerns_everything(take: Pat
     path = tmp_path / "take" / "L" / "0002.png"
     os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns + 2_000_000_000))
     assert all(a != b for a, b in zip(keys(take).values(), keys(tmp_path / "take").values()))
+
+
+def finished(folder: Path) -> dict[str, Any]:
+    """What run.json has of a run of all stages."""
+    content = keys(folder, stamp=FileDigests().stamp)
+    return {"stages": {stage: {"key": key, CONTENT: content[stage]} for stage, key in keys(folder).items()}}
+
+
+def copied(take: Path, to: Path) -> Path:
+    """A copy of everything, made later, as by `cp -r`."""
+    shutil.copytree(take, to, copy_function=shutil.copyfile)
+    for path in to.rglob("*.png"):
+        os.utime(path, ns=(0, path.stat().st_mtime_ns + 5_000_000_000))
+    return to
+
+
+def known(folder: Path, run: dict[str, Any], overrides: dict[str, Any] | None = None, **changes: Any) -> list[str]:
+    """The stages that are done in a folder, as in the run."""
+    now = keys(folder, overrides, **changes)
+    found = known_keys(now, run, lambda: keys(folder, overrides, stamp=FileDigests().stamp, **changes))
+    return [stage for stage in STAGES if found[stage] == run["stages"][stage]["key"]]
+
+
+def other_picture(path: Path) -> None:
+    """Another picture in a file of the same size, with a later time."""
+    size, time = path.stat().st_size, path.stat().st_mtime_ns
+    image = cv2.blur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (5, 5))
+    data = cv2.imencode(".png", image)[1].tobytes()
+    path.write_bytes(data + bytes(size - len(data)))  # what follows the end of a PNG is ignored
+    os.utime(path, ns=(time, time + 3_000_000_000))
+    assert path.stat().st_size == size
+
+
+def test_a_copy_with_other_times_is_no_change(take: Path, tmp_path: Path) -> None:
+    run, copy = finished(take), copied(take, tmp_path / "copy")
+    assert keys(copy)["measure"] != keys(take)["measure"] and known(copy, run) == list(STAGES)
+    assert known(copy, run, fps=50.0) == ["measure"] and known(copy, run, {"fitting": {"frame_steps": 3}}) == ["measure", "track"]
+    earlier = {"stages": {stage: {"key": entry["key"]} for stage, entry in run["stages"].items()}}
+    assert known(copy, earlier) == [], "an earlier version noted no content"
+
+
+def test_another_image_of_the_same_size_concerns_everything(take: Path, tmp_path: Path) -> None:
+    run, copy = finished(take), copied(take, tmp_path / "copy")
+    other_picture(copy / "L" / "0002.png")
+    assert known(copy, run) == []
+
+
+def test_the_content_is_read_only_where_it_matters(take: Path, tmp_path: Path) -> None:
+    run, copy, read = finished(take), copied(take, tmp_path / "copy"), list[int]()
+
+    def content() -> dict[str, str]:
+        read.append(1)
+        return keys(copy, stamp=FileDigests().stamp)
+
+    assert known_keys(keys(take), run, content) == keys(take) and not read
+    assert known_keys(keys(copy), run, content) == keys(take) and len(read) == 1
+    for stage, key in keys(copy).items():
+        run["stages"][stage][STAMPED] = key
+    assert known_keys(keys(copy), run, content) == keys(take) and len(read) == 1
+
+
+def test_new_contours_of_a_copy_are_told_from_its_times(take: Path, tmp_path: Path) -> None:
+    run, copy = finished(take), copied(take, tmp_path / "copy")
+    store.write_text(copy / "out" / "contours" / "L.csv", "frame,x,y\n")
+    assert known(copy, run) == ["measure", "track"]
+    now = known_keys(keys(copy), run, lambda: keys(copy, stamp=FileDigests().stamp))
+    assert "fit" in valid_stages(run, now, ignore_contours=True) and "fit" not in valid_stages(run, now)
+
+
+def test_a_movie_counts_by_its_size_and_its_ends(tmp_path: Path) -> None:
+    path, digests = tmp_path / "a.mp4", FileDigests()
+    content = np.random.default_rng(0).bytes(5 << 20)
+    whole = bytearray(content)
+    stamps = []
+    for time, at in enumerate((None, 0, len(whole) - 1, len(whole) // 2)):
+        changed = bytearray(whole)
+        if at is not None:
+            changed[at] ^= 1
+        path.write_bytes(changed)
+        os.utime(path, (time, time))
+        stamps.append(digests.stamp(path))
+    assert len(set(stamps)) == 3 and stamps[0] == stamps[3], "the middle of a movie is not read"
+    path.rename(tmp_path / "a.png")
+    assert digests.stamp(tmp_path / "a.png")[2] != stamps[0][2]
+
+
+def test_a_run_of_a_copy_computes_nothing_and_of_another_image_everything(
+    plane_take: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = {"growing": {"spacing_px": 16}}
+    pipeline.run(plane_take, tmp_path / "out", given, frames=(0, 2))
+    copy, out = copied(plane_take, tmp_path / "copy"), tmp_path / "out"
+    argv = ["run", str(copy), "--out", str(out), "--frames", "0:2", "--set", "growing.spacing_px=16", "--workers", "1"]
+    files = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.name != "run.json"}
+    assert main.main(argv) == 0 and "Nothing has changed" in capfd.readouterr().out
+    assert files == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.name != "run.json"}
+    before = (out / "run.json").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(FileDigests, "stamp", None)  # the copy is remembered
+        assert main.main(argv) == 0 and "Nothing has changed" in capfd.readouterr().out and (out / "run.json").read_bytes() == before
+    cloud = (out / "clouds" / "0001.ply").read_bytes()
+    other_picture(next(iter(sorted((copy / "L").glob("*1.png")))))
+    assert main.main(argv) == 0 and "Nothing has changed" not in capfd.readouterr().out
+    assert (out / "clouds" / "0001.ply").read_bytes() != cloud
 
 
 def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
