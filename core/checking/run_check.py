@@ -21,6 +21,7 @@ from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..motion.formats.ply import read_ply
 from ..motion.tables import JointTable, MotionTable, read_joints, read_motion
+from ..results import blend_file
 from ..results.folder import lost
 from ..results.run_json import read_run
 from .findings import Cause, Checked, Finding, doubtful, wrong
@@ -90,6 +91,8 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
         if less:
             sentence = f"{', '.join(less)} of the stage “{stage}” in {folder} is missing, cut, or lacks files."
             findings.append(wrong(Cause.FILES_MISSING, sentence, again))
+    if fault := blend_file.lacking(folder, run):
+        findings.append(wrong(Cause.FILES_MISSING, f"{blend_file.BLEND} in {folder} {fault}.", again))
     return findings
 
 

@@ -8,6 +8,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..report.film import write_film
+from ..results import blend_file
 from ..results.folder import check_separate_folder
 from ..results.run_json import notes_of
 from ..run import pipeline, take_run
@@ -116,9 +117,9 @@ def _engine(args: argparse.Namespace) -> Engine | None:
 
 
 def _has_scene(job: take_run.Run, given: argparse.Namespace) -> bool:
-    """Whether body.blend is there, or cannot be made by this command."""
+    """Whether body.blend is there and whole, or cannot be made by this command."""
     without = "scene" not in _names_of(given.parser) or importlib.util.find_spec("bpy") is None
-    return without or job.results.path("body.blend").is_file()
+    return without or blend_file.is_whole(job.results.path(blend_file.BLEND))
 
 
 def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:

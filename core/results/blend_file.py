@@ -16,6 +16,8 @@ from ..foundation.errors import InputError
 from .run_json import read_run
 
 BLEND = "body.blend"
+PLAIN, ZSTANDARD = b"BLENDER", b"\x28\xb5\x2f\xfd"  # first bytes of a file, not compressed and compressed
+LAST_BLOCK, TABLE_END, TAIL_BYTES = b"ENDB", b"\xb1\xea\x92\x8f", 64  # and what is in the last ones
 DIGESTS = "blend"  # entry of run.json: of the file as Tricap wrote it, and of the one that it replaced
 
 
@@ -43,6 +45,26 @@ def note_written(folder: Path, file: Path) -> None:
         run, new = read_run(folder / "run.json"), _digest(file)
         if new not in (before := _noted(run)):
             store.write_json(folder / "run.json", {**run, DIGESTS: [*before[-1:], new]})
+
+
+def lacking(folder: Path, run: Mapping[str, Any]) -> str:
+    """What is wrong with body.blend in the results `folder`, as the end of a sentence; "" if it is whole, or was never written."""
+    path = folder / BLEND
+    if not path.exists():
+        return "is missing" if _noted(run) else ""
+    return "" if is_whole(path) else "is cut, or no Blender file"
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a Blender file has its end: the last block, or the table of a compressed file's parts. An unreadable one has none."""
+    try:
+        with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
+            first = file.read(len(PLAIN))
+            file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+            tail = file.read()
+    except OSError:
+        return False
+    return tail.endswith(TABLE_END) if first.startswith(ZSTANDARD) else first == PLAIN and LAST_BLOCK in tail
 
 
 def _noted(run: Mapping[str, Any]) -> list[str]:

@@ -118,6 +118,10 @@ def frames_cut_without_body(folder: Path) -> None:
     (folder / "out" / "frames.csv").write_text("")
 
 
+def scene_cut(folder: Path) -> None:
+    (folder / "out" / "body.blend").write_bytes(b"BLENDER17-01 and no end")
+
+
 def take_changed(folder: Path) -> None:
     with open(folder / "take" / "take.toml", "a") as file:
         file.write("# another thought\n")
@@ -172,7 +176,7 @@ def damaged(folder: Path) -> None:
 
 
 RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "files missing", skin_gone: "files missing",
-           frames_cut_without_body: "files missing",
+           frames_cut_without_body: "files missing", scene_cut: "files missing",
            take_changed: "stale result", thin: "coverage", unsure: "large sigma", bare_forearm: "coverage",
            unsure_angle: "large sigma", warned: "warning",
            rays: "rays miss", damaged: "input"}  # fmt: skip

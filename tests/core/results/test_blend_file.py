@@ -47,6 +47,22 @@ def test_what_tricap_wrote_stays_and_what_was_edited_gets_a_free_name(tmp_path: 
     assert len(blends(tmp_path)) == 3 and blend_file.keep_edited(tmp_path) == ""
 
 
+PLAIN = b"BLENDER17-01" + 400 * b"x" + b"ENDB" + bytes(28)
+PACKED = b"\x28\xb5\x2f\xfd" + 400 * b"x" + b"\x03\x00\x00\x00\x00\xb1\xea\x92\x8f"
+
+
+@pytest.mark.parametrize("content", [PLAIN, PACKED])
+def test_a_file_without_its_end_is_noticed(tmp_path: Path, content: bytes) -> None:
+    blend = written(tmp_path, content)
+    run = store.read_json(tmp_path / "run.json")
+    assert blend_file.is_whole(blend) and blend_file.lacking(tmp_path, run) == "" and blend_file.lacking(tmp_path, {}) == ""
+    for part in (content[:200], content[:-40], b"", b"nothing like it"):
+        blend.write_bytes(part)
+        assert not blend_file.is_whole(blend) and blend_file.lacking(tmp_path, run) == "is cut, or no Blender file"
+    blend.unlink()
+    assert not blend_file.is_whole(blend) and blend_file.lacking(tmp_path, run) == "is missing" and blend_file.lacking(tmp_path, {}) == ""
+
+
 @pytest.mark.parametrize("record", ["earlier version", "damaged", "missing"])
 def test_without_a_record_it_may_have_edits(tmp_path: Path, record: str) -> None:
     blend = written(tmp_path)
