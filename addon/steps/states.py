@@ -38,7 +38,6 @@ OUTDATED = "Inputs have changed since this step ran. Run it again."
 NEEDED_JOINTS = 2  # the fewest that the fit accepts
 CACHED_CLICKS = 500  # joints whose clicks are remembered as checked
 CACHED_SEQUENCES = 50
-MOST_READ = 500_000_000  # bytes of images whose content is read here, which takes half a second
 
 
 class Status(StrEnum):
@@ -367,16 +366,15 @@ def joints_of(model: str) -> tuple[str, ...]:
 def _keys(found: _Project) -> Mapping[str, str] | None:
     if found.footage is None or found.take is None or found.out is None:
         return None
-    from ...core.run.file_digests import FileDigests, is_movie
+    from ...core.run.file_digests import FileDigests, is_read
     from ...core.run.stages import known_keys, stage_keys
 
     footage, out, file = found.footage, found.out, get_session().file
     settings = settings_of(found.take.settings, {}, "The panel")
 
     def by_content() -> Mapping[str, str]:
-        images = (path for sequence in footage.sequences for path in sequence.files() if not is_movie(path))
-        if sum(path.stat().st_size for path in images) > MOST_READ:
-            return {}  # the next run reads them, and notes that they are the same
+        if not is_read(footage):
+            return {}
         file.digests = file.digests or FileDigests()
         return stage_keys(footage, settings, out, file.digests.stamp)
 

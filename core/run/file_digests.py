@@ -1,7 +1,7 @@
 """The content of footage files as digests: a copy with new times of modification is recognised, another export of the same size is not.
 
 Movies, which may have gigabytes, count by their size and by their first and last MiB: there, or close by, every container has its index
-with the sizes of all pictures.
+with the sizes of all pictures. Images beyond `MOST_READ` are not read: of such a take, a copy is another one.
 """
 
 import hashlib
@@ -9,8 +9,10 @@ from pathlib import Path
 
 from ..foundation import bounded
 from ..images.sequence import MOVIE_ENDINGS
+from ..take.footage import Footage
 
 END_BYTES = 1 << 20  # of a movie, at its beginning and at its end
+MOST_READ = 500_000_000  # bytes of images, which takes about a second
 
 
 class FileDigests:
@@ -30,6 +32,11 @@ class FileDigests:
         if key not in self._of:
             self._of[key] = _digest(path, state.st_size)
         return path.name, state.st_size, self._of[key]
+
+
+def is_read(footage: Footage) -> bool:
+    """Whether the content of a take's images is read."""
+    return sum(path.stat().st_size for sequence in footage.sequences for path in sequence.files() if not is_movie(path)) <= MOST_READ
 
 
 def is_movie(path: Path) -> bool:

@@ -280,19 +280,21 @@ def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "motion.csv").exists()
 
 
-def test_a_copy_of_large_footage_is_read_by_the_next_run(
+def test_a_copy_of_large_footage_is_not_read(
     blender: ModuleType, done: Any, words: Words, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not by the panel, which would stand still meanwhile."""
-    from bl_ext.user_default.tricap.addon.steps import states
+    """Panel and run would stand still meanwhile; the steps run again, from their checkpoints."""
+    from bl_ext.user_default.tricap.core.run import file_digests
 
-    monkeypatch.setattr(states, "MOST_READ", 1000)
+    monkeypatch.setattr(file_digests, "MOST_READ", 1000)
     image = tmp_path / "take" / "C" / "0001.png"
     os.utime(image, ns=(1, image.stat().st_mtime_ns + 3_000_000_000))
     assert words().split()[3:7] == ["stale", "stale", "stale", "stale"]
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.ply")}
+    files = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.ply")}
     assert blender.ops.tricap.run() == {"FINISHED"} and words().split()[3:7] == ["done", "done", "done", "done"]
-    assert files == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.ply")}
+    assert files == {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.ply")}
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert not any("content" in stage for stage in run["stages"].values())
 
 
 def test_objects_and_clips_that_the_user_deleted_or_renamed(blender: ModuleType, done: Any, words: Words, why: Any) -> None:
