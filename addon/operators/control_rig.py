@@ -1,8 +1,13 @@
-"""bpy.ops.tricap.make_control_rig(), bpy.ops.tricap.snap_limbs(to="IK", limbs="upper_arm.L, thigh.R", frames="PLAYED")"""
+"""bpy.ops.tricap.make_control_rig(), bpy.ops.tricap.snap_limbs(to="IK", limbs="upper_arm.L, thigh.R"), bake_limbs(to="IK", …)"""
+
+from collections.abc import Callable, Generator
+from typing import Any
 
 import bpy
 
 from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ..jobs import JobOperator
 from ..panels import TellingOperator
 from ..retarget import control_rig, snapping
 from ..retarget.playing import played_frames
@@ -40,36 +45,60 @@ class MakeControlRig(TellingOperator, bpy.types.Operator):
         return f"“{made.rig.name}” plays the motion within {off}. The bones of the body are hidden (Alt H)."
 
 
+TO = bpy.props.EnumProperty(name="To", items=[("IK", "IK", "Pose limbs by hand and foot"), ("FK", "FK", "Pose limbs by rotations")])
+LIMBS = bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")
+
+
+def _named(limbs: str) -> list[str]:
+    return [limb.strip() for limb in limbs.split(",") if limb.strip()]
+
+
+def _said(count: int, to: str, where: str) -> str:
+    return f"{count} limb{'s are' if count > 1 else ' is'} in {to} {where}."
+
+
 class SnapLimbs(TellingOperator, bpy.types.Operator):
-    """Switch arms and legs between IK and FK without moving the body: in this frame, which Auto Keying keys while others stay as they are,
-    or with keys in all frames that are played"""
+    """Switch arms and legs between IK and FK in this frame without moving the body. Auto Keying keys it; other frames stay as they are"""
 
     bl_idname = "tricap.snap_limbs"
     bl_label = "Snap Limbs"
     bl_options = {"REGISTER", "UNDO"}
 
-    to: bpy.props.EnumProperty(name="To", items=[("IK", "IK", "Pose limbs by hand and foot"), ("FK", "FK", "Pose limbs by rotations")])  # type: ignore[valid-type]
-    limbs: bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")  # type: ignore[valid-type]
-
-    frames: bpy.props.EnumProperty(  # type: ignore[valid-type]
-        name="Frames",
-        items=[
-            ("CURRENT", "This Frame", "In the current frame; with Auto Keying, with keys, so that other frames do not change"),
-            ("PLAYED", "Played Frames", "With keys in every frame of the preview range, or else of the scene"),
-        ],
-    )
+    to: TO  # type: ignore[valid-type]
+    limbs: LIMBS  # type: ignore[valid-type]
 
     def do(self, context: bpy.types.Context) -> str:
         """Snap them."""
-        limbs, body = [limb.strip() for limb in self.limbs.split(",") if limb.strip()], body_of(context)
-        if self.frames == "PLAYED":
-            frames = played_frames(context.scene)
-            count, where = snapping.snap_frames(body, self.to, limbs, frames), f"in frames {frames.start}–{frames.stop - 1}"
-        else:
-            count, where = snapping.snap(body, self.to, limbs), "in this frame"
-            keyed = context.scene.tool_settings.use_keyframe_insert_auto
-            where += "; other frames are as before" if keyed else ", without keys: another frame shows what is keyed"
-        return f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} {where}."
+        count, keyed = snapping.snap(body_of(context), self.to, _named(self.limbs)), context.scene.tool_settings.use_keyframe_insert_auto
+        kept = "; other frames are as before" if keyed else ", without keys: another frame shows what is keyed"
+        return _said(count, self.to, f"in this frame{kept}")
+
+
+class BakeLimbs(JobOperator, bpy.types.Operator):
+    """Switch arms and legs between IK and FK, with keys in every frame that is played (preview range or scene), without moving the body"""
+
+    bl_idname = "tricap.bake_limbs"
+    bl_label = "Bake Limbs"
+    bl_options = {"REGISTER", "UNDO"}
+
+    if_stopped = "The control rig is as before."
+
+    to: TO  # type: ignore[valid-type]
+    limbs: LIMBS  # type: ignore[valid-type]
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
+        """Body and frames; what there is to compute needs Blender."""
+        self._body, self._frames = body_of(context), played_frames(context.scene)
+        return lambda monitor: None
+
+    def in_steps(self, context: bpy.types.Context, result: Any, monitor: Monitor) -> Generator[None, None, Any]:
+        """Snap them, frame by frame."""
+        return (yield from snapping.snapping_frames(self._body, self.to, _named(self.limbs), self._frames, monitor))
+
+    def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
+        """Report it."""
+        self.report({"INFO"}, _said(result, self.to, f"in frames {self._frames.start}–{self._frames.stop - 1}"))
+        return {"FINISHED"}
 
 
 def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
@@ -82,8 +111,7 @@ def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
         row.operator("tricap.snap_limbs", text=f"Snap to {to}", icon="SNAP_ON").to = to
     row = layout.row(align=True)
     for to in ("IK", "FK"):
-        button = row.operator("tricap.snap_limbs", text=f"Bake to {to}", icon="KEYINGSET")
-        button.to, button.frames = to, "PLAYED"
+        row.operator("tricap.bake_limbs", text=f"Bake to {to}", icon="KEYINGSET").to = to
 
 
-CLASSES = (MakeControlRig, SnapLimbs)
+CLASSES = (MakeControlRig, SnapLimbs, BakeLimbs)

@@ -1,7 +1,7 @@
 """Limbs of a control rig change between IK and FK without moving the body, by the operators of Rigify's own script."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import atan2
 
@@ -9,6 +9,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from ..scene import stored
 from ..scene.armature import SNAPS_KEY
 from ..scene.standing import controls_of_body
@@ -62,33 +63,34 @@ def snap(body: bpy.types.Object, to: str, limbs: Sequence[str] = ()) -> int:
     return len(chosen)
 
 
-def snap_frames(body: bpy.types.Object, to: str, limbs: Sequence[str], frames: range) -> int:
-    """`snap` in each of these frames, with keys whether Auto Keying is on or not; frames before and after them keep what they play.
-
-    Takes about 0.1 s for each limb and frame.
+def snapping_frames(
+    body: bpy.types.Object, to: str, limbs: Sequence[str], frames: range, monitor: Monitor | None = None
+) -> Generator[None, None, int]:
+    """`snap` in each of these frames, a step each, with keys whether Auto Keying is on or not; frames before and after them keep what they
+    play. The keys are set in the end. About 0.1 s for each limb and frame.
 
     Raises:
         InputError: see `snap`; there are no frames.
+        Cancelled: the monitor was cancelled; nothing has changed.
     """
     rig, chosen = _chosen(body, limbs)
     if not frames:
         raise InputError("The scene plays no frames; correct its frame range.")
-    scene, now, before = bpy.context.scene, bpy.context.scene.frame_current, frame_keys.pose_of(rig)
+    monitor, scene, now, before = monitor or Monitor(), bpy.context.scene, bpy.context.scene.frame_current, frame_keys.pose_of(rig)
     keyed, values = _channels(rig, to, chosen), []
-    bpy.context.window_manager.progress_begin(0, len(frames))
     try:
         with _without_meshes():
             for i, frame in enumerate(frames):
+                monitor.step("snapping limbs", i, len(frames))
                 frame_keys.put(rig, before)  # channels without keys; the others get theirs from the frame
                 scene.frame_set(frame)
                 for limb, arguments in chosen.items():
                     _snap(rig, body, to, limb, arguments)
                 values.append(frame_keys.values_of(keyed, frame_keys.pose_of(rig)))
-                bpy.context.window_manager.progress_update(i + 1)
+                yield
             frame_keys.put(rig, before)
             frame_keys.key_frames(rig, frames, values)
     finally:
-        bpy.context.window_manager.progress_end()
         frame_keys.put(rig, before)
         scene.frame_set(now)
     return len(chosen)

@@ -197,7 +197,7 @@ def test_limbs_are_snapped_over_the_frames_that_are_played(blender: ModuleType) 
     scene.frame_set(5)
     mesh = blender.data.objects.new("Skin", blender.data.meshes.new("Skin"))
     scene.collection.objects.link(mesh)
-    assert blender.ops.tricap.snap_limbs(to="IK", frames="PLAYED") == {"FINISHED"}
+    assert blender.ops.tricap.bake_limbs(to="IK") == {"FINISHED"}
     assert scene.frame_current == 5 and not mesh.hide_viewport
     check_all(scene, body, wanted)
     for limb in ("thigh.L", "upper_arm.R"):
@@ -205,16 +205,33 @@ def test_limbs_are_snapped_over_the_frames_that_are_played(blender: ModuleType) 
     lift(rig, "foot_ik.R", scene, range(4, 7))
     lifted = poses(scene, body)
     assert max(np.abs(lifted[5][1] - wanted[5][1]).max(axis=1)) > 0.02
-    assert blender.ops.tricap.snap_limbs(to="FK", limbs="thigh.R", frames="PLAYED") == {"FINISHED"}
+    assert blender.ops.tricap.bake_limbs(to="FK", limbs="thigh.R") == {"FINISHED"}
     check_all(scene, body, lifted)
     assert switches(scene, rig, "thigh.R") == [1.0] * FRAMES and switches(scene, rig, "thigh.L")[5] == 0.0
     scene.use_preview_range = False
-    assert blender.ops.tricap.snap_limbs(to="FK", frames="PLAYED") == {"FINISHED"}
+    assert blender.ops.tricap.bake_limbs(to="FK") == {"FINISHED"}
     check_all(scene, body, lifted)
     assert not any(0.0 in switches(scene, rig, limb) for limb in ("thigh.L", "thigh.R", "upper_arm.L", "upper_arm.R"))
     snapping = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.snapping")
     with pytest.raises(snapping.InputError, match="plays no frames"):
-        snapping.snap_frames(body, "FK", (), range(0))
+        next(snapping.snapping_frames(body, "FK", (), range(0)))
+
+
+def test_baking_limbs_is_stopped_and_nothing_has_changed(blender: ModuleType) -> None:
+    body, scene = corrected(blender), blender.context.scene
+    rig, wanted = blender.data.objects["Body controls"], poses(scene, body)
+    snapping = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.snapping")
+    before = {curve.data_path: len(curve.keyframe_points) for curve in curves_of(rig.animation_data.action)}
+    scene.frame_set(5)
+    monitor = snapping.Monitor()
+    steps = snapping.snapping_frames(body, "IK", (), range(FRAMES), monitor)
+    next(steps)
+    next(steps)
+    monitor.cancel()
+    with pytest.raises(importlib.import_module("bl_ext.user_default.tricap.core.foundation.progress").Cancelled):
+        next(steps)
+    assert scene.frame_current == 5 and {c.data_path: len(c.keyframe_points) for c in curves_of(rig.animation_data.action)} == before
+    check_all(scene, body, wanted)
 
 
 def corrected(bpy: ModuleType) -> Any:
