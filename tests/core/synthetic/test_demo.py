@@ -26,7 +26,7 @@ def test_every_knob_of_the_recording_and_of_the_run(tmp_path: Path, monkeypatch:
 
     def run(take: Path, out: Path, given: Any, monitor: Any, engine: Any) -> Any:
         asked.append(given)
-        return SimpleNamespace(record={"warnings": []})
+        return SimpleNamespace(record={"warnings": []}, notes=[])
 
     monkeypatch.setattr(pipeline, "run", run)
     out, picture = tmp_path / "demo", tmp_path / "demo" / "take" / "C" / "0001.png"
