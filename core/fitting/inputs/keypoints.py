@@ -89,6 +89,11 @@ class JointTracks:
         """The joints that have a keypoint in frame index `t`."""
         return sorted({int(j) for _, joint, rows in self._rows(t) for j in joint[rows]})
 
+    @property
+    def of_any_frame(self) -> list[int]:
+        """The joints of the model that any table of keypoints has."""
+        return sorted({int(j) for _, joint in self._tables for j in joint[joint >= 0]})
+
     def best_frame(self) -> int:
         """The frame index in which most joints are located."""
         return int(np.argmax([np.isfinite(self.located(t)).all(axis=1).sum() for t in range(len(self._frames))]))

@@ -8,11 +8,11 @@ from where it usually lies (m, of the body model), the clicks of any frame, and 
     d = m + c + o ,   c ~ N(0, COMMON r) the same on the left and on the right (mirrored) ,   o ~ N(0, OWN r)                         (2)
     X(θ_t + p_t, L) − X(θ_t) − R d ~ N(0, MOTION_SIGMA_M) ,   p_t ~ N(0, TURN_SIGMA)                                              (3)
 
-r is the thickness of the flesh at the joint. The priors of L are those of the fit, about lengths that follow the usual places. σ is
-estimated from how well the rays of the clicks meet, with the knob `click_sigma_px` as `PRIOR_FREEDOM` further observations. Unknown are d,
-the bone lengths L with their priors, and p_t, which are eliminated frame by frame. In (3) the frames within `CORRELATION_S` count as one.
-The metaballs stay where they are: their centres in the bones' axes change. A joint whose clicks are further away than (1) and (2) explain
-is in a wrong pose, and not in another place.
+r is the thickness of the flesh at the joint; m is 0 of joints with keypoints. The priors of L are those of the fit, about lengths that
+follow the usual places. σ is estimated from how well the rays of the clicks meet, with the knob `click_sigma_px` as `PRIOR_FREEDOM` further
+observations. Unknown are d, the bone lengths L with their priors, and p_t, which are eliminated frame by frame. In (3) the frames within
+`CORRELATION_S` count as one. The metaballs stay where they are: their centres in the bones' axes change. A joint whose clicks are further
+away than (1) and (2) explain is in a wrong pose, and not in another place.
 """
 
 from collections.abc import Sequence
@@ -75,7 +75,7 @@ def joints_in_place(fit: FitContext, motion: np.ndarray, vector: np.ndarray, tim
     """The places of the joints, for a body with a motion (T, D) at `time_s` (T,) and a vector (S,); None where nothing tells them: without
     clicks and without usual places."""
     seen = _seen(fit, motion, vector)
-    if not seen and not fit.model.joint_places_m:
+    if not seen and not _usual_m(fit).any():
         return None
     some = np.unique(np.linspace(0, len(motion) - 1, min(FRAMES, len(motion))).round().astype(int))
     share = min(1.0, float(np.median(np.diff(time_s[some]))) / CORRELATION_S) if len(some) > 1 else 1.0
@@ -212,8 +212,10 @@ def _of_shifts(fit: FitContext, seen: Sequence[_Seen]) -> tuple[np.ndarray, np.n
 
 
 def _usual_m(fit: FitContext) -> np.ndarray:
-    """m (J, 3) [m]."""
-    return np.array([fit.model.joint_places_m.get(name, np.zeros(3)) for name in fit.parameters.skeleton.joint_names])
+    """m (J, 3) [m]; zero where keypoints determine a joint, and not the surface alone."""
+    usual = np.array([fit.model.joint_places_m.get(name, np.zeros(3)) for name in fit.parameters.skeleton.joint_names])
+    usual[fit.tracks.of_any_frame] = 0.0
+    return usual
 
 
 def _longer_by_usual_places(fit: FitContext) -> np.ndarray:

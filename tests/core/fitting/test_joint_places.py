@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.fitting.inputs.fit_input import FitInput
+from tricap.core.fitting.inputs.fit_input import JointPlaces as Table
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.joint_places import has_both_sides, joints_in_place
@@ -77,6 +78,17 @@ def test_a_joint_without_a_click_moves_to_its_usual_place(make_scene) -> None:
     for before, now in zip(fit.parameters.states(scene.motion, solution.vector), moved.parameters.states(after.motion, after.vector)):
         wanted = before.R[before.skeleton.joint_bones[j][0]] @ SHIFT
         assert np.linalg.norm(now.joints_m[j] - before.joints_m[j] - wanted) < 0.4 * np.linalg.norm(SHIFT), "in every frame"
+
+
+def test_keypoints_of_a_joint_leave_it_where_they_had_it(make_scene) -> None:
+    """Usual places are those beside a fit to the surface alone."""
+    scene = make_scene(frames=4, click_px=0.0)
+    j = scene.shape.skeleton.joint_names.index("elbow.R")
+    table = Table(view="", frame=np.arange(4), joint=["elbow.R"] * 4, place=scene.joints_m[:, j], sigma=np.full(4, 0.01))
+    fit = fit_context(replace(_given(scene, {0: scene.clicks}), keypoints=[table]), SETTINGS)
+    fit, vector = _usually(replace(fit, clicked={}), {"elbow.R": SHIFT, "wrist.R": SHIFT}), fit.parameters.vector(scene.shape)
+    found = joints_in_place(fit, scene.motion, vector, scene.time_s)
+    assert found is not None and np.linalg.norm(found.shift[j]) < 0.2 * np.linalg.norm(SHIFT) < np.linalg.norm(found.shift[j + 1])
 
 
 def test_clicks_count_more_than_the_usual_place(make_scene) -> None:
