@@ -12,7 +12,7 @@ import window
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-SCRIPTS = ("sample", "workflow", "over_footage", "review", "smooth", "points", "points_2d")
+SCRIPTS = ("sample", "workflow", "control_rig", "over_footage", "review", "smooth", "points", "points_2d")
 LIMIT_S = 480.0
 SIZE = (1600, 1000)
 
