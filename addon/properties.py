@@ -177,7 +177,7 @@ def _of_what_is_shown() -> dict[str, Any]:
             name="Foot Lock",
             options=set(),
             get=lambda group: any(foot_lock.is_active(body) for body in standing.all_bodies(group.id_data)),
-            set=lambda group, value: foot_lock.let_act(group.id_data, value),
+            set=lambda group, value: foot_lock.activate_all(group.id_data, value),
             description="Let the foot lock act; without it the feet move as measured",
         ),
     }

@@ -202,7 +202,7 @@ def activate(body: bpy.types.Object, active: bool) -> None:
         constraint.mute = not active
 
 
-def let_act(scene: bpy.types.Scene, active: bool) -> None:
+def activate_all(scene: bpy.types.Scene, active: bool) -> None:
     """Let the foot lock of the scene's bodies act, or mute it.
 
     Raises:

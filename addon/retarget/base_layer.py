@@ -113,7 +113,7 @@ def _released(body: bpy.types.Object) -> Iterator[None]:
 
 def _properties() -> dict[str, dict[str, float]]:
     """By bone, the custom properties with which the FK controls move the limbs."""
-    return {f"{chain[0]}_parent.{side}": LIMB_PROPERTIES for chain in metarig.LIMBS.values() for side in "LR"}
+    return {metarig.master_of(f"{chain[0]}.{side}"): LIMB_PROPERTIES for chain in metarig.LIMBS.values() for side in "LR"}
 
 
 def _of_controls(rig: bpy.types.Object, body: bpy.types.Object, motion: Motion) -> "Retargeted":

@@ -30,6 +30,12 @@ def control_of(bone: str) -> str:
     return f"{part}_fk.{side}" if any(part in chain for chain in LIMBS.values()) else bone
 
 
+def master_of(limb: str) -> str:
+    """The bone with the switches of a limb ("thigh.L", its first bone), such as that between IK and FK."""
+    part, _, side = limb.partition(".")
+    return f"{part}_parent.{side}"
+
+
 def needed_bones() -> tuple[str, ...]:
     """The bones that a body needs for a control rig."""
     return (*SINGLE, *(f"{bone}.{side}" for side in "LR" for bones in LIMBS.values() for bone in bones))

@@ -14,7 +14,7 @@ from ..scene import stored
 from ..scene.armature import SNAPS_KEY
 from ..scene.standing import controls_of_body
 from . import frame_keys, metarig
-from .metarig import DRIVE, control_of
+from .metarig import DRIVE, control_of, master_of
 from .write import CHANNEL
 
 MOST_TURNS, SMALLEST_TURN_RAD = 6, 1e-5  # of the base of an IK limb, until its middle joint is where it was
@@ -129,7 +129,7 @@ def _channels(rig: bpy.types.Object, to: str, chosen: Mapping[str, Mapping[str, 
         for name in (*controls, *(DRIVE + name for name in _chain(limb))):
             channel = CHANNEL.get(rig.pose.bones[name].rotation_mode, ("rotation_euler", 3))[0]
             found += [(name, "location"), (name, channel), (name, "scale")]
-        found.append((_master(limb), SWITCH))
+        found.append((master_of(limb), SWITCH))
     return found
 
 
@@ -163,7 +163,7 @@ def _snap_to_ik(rig: bpy.types.Object, body: bpy.types.Object, limb: str, argume
     wanted = {name: rig.matrix_world.inverted() @ body.matrix_world @ body.pose.bones[name].matrix for name in chain}
     joint = bones[f"ORG-{chain[1]}"].head.copy()
     _call_rigify(rig, f"rigify_limb_ik2fk_{rig.data['rig_id']}", arguments)
-    bones[_master(limb)]["IK_FK"] = 0.0
+    bones[master_of(limb)]["IK_FK"] = 0.0
     _update(rig)
     base = bones[_names(arguments["ctrl_bones"])[0]]
     for _ in range(MOST_TURNS):  # about the line from the limb's first to its last joint, until elbow or knee is where it was
@@ -181,7 +181,7 @@ def _snap_to_ik(rig: bpy.types.Object, body: bpy.types.Object, limb: str, argume
 
 def _snap_to_fk(rig: bpy.types.Object, body: bpy.types.Object, limb: str, _: dict[str, str]) -> None:
     wanted = {name: rig.matrix_world.inverted() @ body.matrix_world @ body.pose.bones[name].matrix for name in _chain(limb)}
-    rig.pose.bones[_master(limb)]["IK_FK"] = 1.0
+    rig.pose.bones[master_of(limb)]["IK_FK"] = 1.0
     for name in _chain(limb):
         drive, control = rig.pose.bones[DRIVE + name], rig.pose.bones[control_of(name)]
         drive.matrix_basis = Matrix()
@@ -225,8 +225,3 @@ def _call_rigify(rig: bpy.types.Object, name: str, arguments: dict[str, str]) ->
         layer.objects.active = active
         if mode == "POSE" and active is not None:
             bpy.ops.object.mode_set(mode="POSE")
-
-
-def _master(limb: str) -> str:
-    part, _, side = limb.partition(".")
-    return f"{part}_parent.{side}"

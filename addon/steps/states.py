@@ -366,14 +366,14 @@ def joints_of(model: str) -> tuple[str, ...]:
 def _keys(found: _Project) -> Mapping[str, str] | None:
     if found.footage is None or found.take is None or found.out is None:
         return None
-    from ...core.run.file_digests import FileDigests, is_read
+    from ...core.run.file_digests import FileDigests, reads_content
     from ...core.run.stages import known_keys, stage_keys
 
     footage, out, file = found.footage, found.out, get_session().file
     settings = settings_of(found.take.settings, {}, "The panel")
 
     def by_content() -> Mapping[str, str]:
-        if not is_read(footage):
+        if not reads_content(footage):
             return {}
         file.digests = file.digests or FileDigests()
         return stage_keys(footage, settings, out, file.digests.stamp)

@@ -93,7 +93,7 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if not is_arm_take(take, sample):
         make_arm_take(take, sample, monitor)
     job = pipeline.run(take, out, given, monitor, engine=of_this_machine())
-    lines, blend = _build_scene(job, args, monitor), out / "body.blend"
+    lines, blend = _build_scene(job, args, monitor), out / blend_file.BLEND
     return [
         str(job),
         *(f"Note: {sentence}" for sentence in job.notes),
@@ -124,7 +124,7 @@ def _has_scene(job: take_run.Run, given: argparse.Namespace) -> bool:
 
 def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Build body.blend with the add-on's command `scene`, where Blender is available."""
-    blend = job.results.path("body.blend")
+    blend = job.results.path(blend_file.BLEND)
     if "scene" not in _names_of(given.parser):
         return []
     try:

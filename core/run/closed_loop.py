@@ -23,13 +23,14 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
+from ..report.loop_pictures import OUTLINES
 from ..report.silhouettes import is_whole_body
 from .outlines import Start, write_contour
 from .take_run import Run
 
-OFF, TRACKS, OUTLINES = "off", "tracks", "outlines"  # values of `fitting.closed_loop`
+OFF, TRACKS = "off", "tracks"  # values of `fitting.closed_loop`, besides OUTLINES
 FOR_WHOLE_BODIES = OFF  # what auto is for them: see docs/decisions.md
-FOLDER = "outlines"  # in OUT: the tables of the outlines, laid out as contours/
+FOLDER = OUTLINES  # in OUT: the tables of the outlines, laid out as contours/
 
 
 def loop_of(settings: FitSettings, skeleton: Skeleton) -> str:

@@ -34,8 +34,8 @@ class FileDigests:
         return path.name, state.st_size, self._of[key]
 
 
-def is_read(footage: Footage) -> bool:
-    """Whether the content of a take's images is read."""
+def reads_content(footage: Footage) -> bool:
+    """Whether the content of a take's images is read: not where they are too large."""
     return sum(path.stat().st_size for sequence in footage.sequences for path in sequence.files() if not is_movie(path)) <= MOST_READ
 
 

@@ -58,7 +58,7 @@ from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds
 from .around_clicks import FITTED_WITH, besides_clicks, fitted_with
 from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .engine import Engine
-from .file_digests import is_read
+from .file_digests import reads_content
 from .fitted_body import FittedBody, read_fitted, write_fitted
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
@@ -146,7 +146,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     if tracked_again and (loop := loop_of(run.settings["fitting"], body.shape.skeleton)) != OFF:
         noted["closed_loop"] = loop
     given_to = run.footage, run.settings, run.results.folder
-    content = {CONTENT: besides_clicks(*given_to, run.digests.stamp)} if is_read(run.footage) else {}
+    content = {CONTENT: besides_clicks(*given_to, run.digests.stamp)} if reads_content(run.footage) else {}
     noted[FITTED_WITH] = {**fitted_with(*given_to), **content}
     run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **noted)
 

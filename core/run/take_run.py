@@ -27,7 +27,7 @@ from ..take.take import Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import Trajectories
 from .engine import Engine
-from .file_digests import FileDigests, is_read
+from .file_digests import FileDigests, reads_content
 from .record import frame_table, new_record, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_keys, stage_keys, valid_stages
@@ -158,7 +158,7 @@ def open_run(
         before, digests = {} if restart else results.read_run(), FileDigests()
 
         def by_content() -> dict[str, str]:
-            return stage_keys(footage, settings, Path(out), digests.stamp) if is_read(footage) else {}
+            return stage_keys(footage, settings, Path(out), digests.stamp) if reads_content(footage) else {}
 
         keys = _known(results, before, keys, by_content)
         record = new_record(footage, settings)

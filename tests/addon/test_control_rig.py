@@ -164,7 +164,7 @@ def test_locked_feet_are_baked_and_the_lock_is_muted(blender: ModuleType) -> Non
         assert blender.ops.tricap.snap_limbs(to="IK", limbs="thigh.L") == {"FINISHED"}
         check_same(pose(body), wanted[9], SNAP_DEG, SNAP_M)
         with pytest.raises(foot_lock.InputError, match="“Body controls” drives “Body” and plays the locked feet"):
-            foot_lock.let_act(scene, True)
+            foot_lock.activate_all(scene, True)
         assert not scene.tricap.foot_lock
         blender.data.objects.remove(blender.data.objects["Body controls"])
 

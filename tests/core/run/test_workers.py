@@ -85,7 +85,7 @@ def test_ctrl_c_in_a_terminal_is_one_sentence_with_the_true_count(plane_take: Pa
     """It goes to the whole group of processes; what the workers have measured by then counts."""
     line = [sys.executable, "-P", "-c", PRESSED, "measure", plane_take, "--out", tmp_path / "out", "--quiet"]
     done = subprocess.run(line, capture_output=True, text=True, start_new_session=True)
-    kept = len(list((tmp_path / "out" / "cache" / "surface").iterdir()))
+    kept = len(list((tmp_path / "out" / "cache" / "surface").glob("[0-9]*.npz")))  # a killed worker leaves a part
     assert done.returncode == 130 and kept >= 1
     assert done.stderr == f"tricap: Stopped: the surface of {kept} of 4 frames is kept; run it again to go on.\n"
 
@@ -128,8 +128,7 @@ def test_a_worker_whose_run_is_gone_ends_without_a_word(tmp_path: Path) -> None:
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     worker = subprocess.Popen(command, env=os.environ | environment, **pipes)  # type: ignore[call-overload]
     worker.stdout.close()  # nobody reads its answers
-    refused = {"take": str(tmp_path), "frames": [0, 1], "delay_images": [], "settings": {"nothing": 1}, "keys": {}}
-    refused["settings"] = {name: {} for name in workers.SETTINGS}
+    refused = {"take": str(tmp_path), "frames": [0, 1], "delay_images": [], "settings": dict.fromkeys(workers.SETTINGS, {}), "keys": {}}
     said = worker.communicate((json.dumps(refused) + "\n").encode())[1]
     assert worker.returncode == 0 and said == b""
 
