@@ -14,6 +14,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..geometry.robust import finite_median
+from ..geometry.view_angles import is_alone
 from ..images.combing import Combing, combing
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
@@ -166,12 +167,13 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     clothes = Clothes.of(footage, matching)
     findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
     combed = film_combing(film) if footage.take.interlaced == "none" else None
-    findings += [*combing_findings(combed), *clothes.findings(), *seed_findings(footage)]
+    matched = fitting.use_surface and not is_alone(footage.rig.cameras, footage.take.reference)
+    findings += [*combing_findings(combed), *(clothes.findings() if matched else []), *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},
         "agreeing_share": round(agreeing_share(pairs, footage.rig.cameras), 4),
-        **clothes.figures(),
+        **(clothes.figures() if matched else {}),
     }
     if not any(f.cause in UNUSABLE for f in findings):
         offsets = estimate_offsets(footage, monitor, film)

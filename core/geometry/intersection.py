@@ -19,6 +19,7 @@ START_STEPS = 2  # of the rays from which (2) starts: within 10⁻⁶ of their d
 CONVERGED_M = 1e-6  # step; the next one would be a thousandth of it
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
 MOST_MISS_SIGMAS = 3.0  # of the clicks, their root mean square; by chance one in 45 000 (two views) or 170 000 (three) misses by more
+JOINT_PLACE_M = 0.015  # sigma of a joint's place in the body, as it is believed from one side
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -87,6 +88,30 @@ def intersect_clicks(cameras: Sequence[Camera], xy_px: np.ndarray, sigma_px: flo
 def clicks_contradict(point: Intersection, sigma_px: float = CLICK_SIGMA_PX) -> np.ndarray:
     """(N,) which points' clicks contradict each other: there is no point, or its rays miss by more than MOST_MISS_SIGMAS."""
     return ~(point.rms_residual_px <= MOST_MISS_SIGMAS * sigma_px)
+
+
+def joint_clicks_contradict(cameras: Sequence[Camera], point: Intersection, sigma_px: float = CLICK_SIGMA_PX) -> np.ndarray:
+    """(N,) which joints' clicks contradict each other: there is no point, or its rays miss by more than `most_miss_px`."""
+    return ~(point.rms_residual_px <= most_miss_px(cameras, point, sigma_px))
+
+
+def most_miss_px(cameras: Sequence[Camera], point: Intersection, sigma_px: float = CLICK_SIGMA_PX) -> np.ndarray:
+    """(N,) by how much, as root mean square, the rays of clicks on joints may miss each other:
+
+    MOST_MISS_SIGMAS √(σ² + (JOINT_PLACE_M f/Z sin α)²), with the largest angle α between rays. A joint lies inside the body. Views beside
+    each other see it from the same side, and err alike; who sees it from the front and from behind believes it in two places.
+    """
+    seen = np.isfinite(point.residual_px[..., 0]) & np.isfinite(point.xyz_m[:, :1])
+    ray = point.xyz_m[:, None] - np.array([camera.centre_m for camera in cameras])
+    depth = np.einsum("nki,ki->nk", ray, np.array([camera.R_cam_world[2] for camera in cameras]))
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    sine = np.linalg.norm(np.cross(ray[:, :, None], ray[:, None]), axis=3)
+    behind = np.einsum("nki,nli->nkl", ray, ray) < 0  # beyond 90° the two sides differ as much as at 90°
+    apart = np.where(seen[:, :, None] & seen[:, None], np.where(behind, 1.0, sine), 0.0).max(axis=(1, 2))
+    focal = np.array([camera.focal_px for camera in cameras])
+    place_px = np.where(seen, JOINT_PLACE_M * apart[:, None] * focal / np.where(depth > 0, depth, np.inf), 0.0)
+    square = sigma_px**2 + (place_px**2).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    return np.asarray(MOST_MISS_SIGMAS * np.sqrt(square))
 
 
 def doubtful_view(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:

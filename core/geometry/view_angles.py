@@ -34,6 +34,11 @@ def neighbours_deg(cameras: Sequence[Camera], reference: int) -> np.ndarray:
     return np.sort(np.delete(axis_angles_deg(cameras, reference), reference))
 
 
+def is_alone(cameras: Sequence[Camera], reference: int) -> bool:
+    """Whether all other views look from too far apart from the reference view for patches to be matched: no surface can be measured."""
+    return bool(neighbours_deg(cameras, reference)[0] > WIDEST_DEG)
+
+
 def second_neighbour_deg(cameras: Sequence[Camera], reference: int) -> float:
     """The angle to the second nearest of the other views; of two views, the angle between them."""
     return float(neighbours_deg(cameras, reference)[:2][-1])

@@ -1,7 +1,7 @@
 """The person in an image, against a background that stands still.
 
-An image is averaged in square cells. A cell's difference r from the background, less that of a slightly different light, is noise where the
-background is visible, and wide where the person covers it:
+An image is averaged in square cells. A cell's difference r from the background, less that of a slightly different light (an offset and a
+gain), is noise where the background is visible, and wide where the person covers it:
 
     p(r | background) = (1 − ε) N(0, σ) + ε Laplace(0, 2 s) ,   p(r | person) = (1 − δ) Laplace(0, s) + δ / 256              (1)
     x = u + w G ∗ tanh(x / 2) ,   u = c ln(p(r | person) / p(r | background)) + seen                                         (2)
@@ -38,21 +38,27 @@ ODDS = (-3.0, 5.0)  # bounds of the logarithm in (2)
 SEEN = 4.0  # of a cell with measured points
 COUPLING, RADIUS, ROUNDS = 6.0, 2.0, 10  # w of (2), sigma of G in cells, iterations
 SMALLEST = 60  # cells of a region
-NORMAL_QUARTILE = 0.3186  # of |N(0, 1)|
+NORMAL_QUARTILE, NORMAL_UPPER = 0.3186, 1.1503  # lower and upper quartile of |N(0, 1)|
+GAIN_CELLS, GAIN_STEPS, GAIN_PRIOR = 4000, 10, 1e4  # of a gain: cells, iterations, and weight of 0 (grey values² over the noise's)
 OTHER_LIGHT = 4.0  # times the noise: the difference of so large a share is not noise
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class CellBackground:
-    """The background of a view in cells (h, w), the noise of a cell in grey values, and how well it is known there, 0 to 1."""
+    """The background of a view in cells (h, w), the noise of a cell in grey values, and how well it is known there, 0 to 1.
+
+    `noise` is that of most cells, `sigma` (h, w) that of each: light that flickers or drifts, and coded movies, change some of them more.
+    """
 
     grey: np.ndarray
     noise: float
+    sigma: np.ndarray
     known: np.ndarray
     cell_px: int
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "grey", frozen(self.grey, (None, None), np.float32, "grey"))
+        object.__setattr__(self, "sigma", frozen(self.sigma, self.grey.shape, np.float32, "sigma"))
         object.__setattr__(self, "known", frozen(self.known, self.grey.shape, np.float32, "known"))
 
 
@@ -87,7 +93,21 @@ def still_background(
     grey = np.where(gain > CLEAR, second, grey)
     known = np.where(gain > CLEAR, 1.0, np.where(gain > 0, 0.0, known))
     known[_same_when_seen(images, seen, grey, noise)] = 0.0
-    return CellBackground(grey=grey, noise=noise, known=known, cell_px=cell_px)
+    return CellBackground(grey=grey, noise=noise, sigma=_sigma(images, near, grey, noise), known=known, cell_px=cell_px)
+
+
+def _sigma(images: Sequence[np.ndarray], near: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> np.ndarray:
+    """The noise (h, w) of each cell and those around: the upper quartile of its differences while nobody is near."""
+    sigma, lights = np.empty(grey.shape, np.float32), [_light(image - grey, grey, noise) for image in images]
+    for row in range(0, len(grey), ROWS):
+        part = slice(row, row + ROWS)
+        left = [np.abs(image[part] - (1 + gain) * grey[part] - offset) for image, (gain, offset) in zip(images, lights)]
+        bare = np.less(left, TIGHT * noise) & ~np.stack([there[part] for there in near])
+        ascending = np.sort(np.where(bare, left, np.inf), axis=0)
+        shown = np.isfinite(ascending).sum(axis=0)
+        quartile = np.take_along_axis(ascending, np.maximum(shown - 1, 0)[None] * 3 // 4, axis=0)[0]
+        sigma[part] = np.where(shown > 0, quartile, 0.0) / NORMAL_UPPER
+    return np.maximum(cv2.GaussianBlur(sigma, (0, 0), RADIUS), noise)
 
 
 def _second_look(images: Sequence[np.ndarray], seen: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -129,19 +149,21 @@ def given_background(grey: np.ndarray, images: Sequence[np.ndarray], cell_px: in
     noise = [q for q in quartiles if q <= OTHER_ROOM]
     if not noise:
         return None
-    return CellBackground(grey=grey, noise=max(LEAST_NOISE, float(np.median(noise))), known=np.ones(grey.shape), cell_px=cell_px)
+    least = max(LEAST_NOISE, float(np.median(noise)))
+    return CellBackground(grey=grey, noise=least, sigma=np.full(grey.shape, least), known=np.ones(grey.shape), cell_px=cell_px)
 
 
 def person(background: CellBackground, image: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
     """Where (h, w) an image in cells shows the person; `seen`: cells with measured points. None in another light, or of a black image."""
-    difference = image - background.grey
-    comparable = difference[background.known == 1] if (background.known == 1).any() else difference.ravel()
-    if np.quantile(np.abs(comparable), EMPTY_SHARE) > OTHER_LIGHT * background.noise:
+    difference, certain = image - background.grey, background.known == 1
+    comparable = certain if certain.any() else np.ones(certain.shape, dtype=bool)
+    if np.quantile(np.abs(difference[comparable]), EMPTY_SHARE) > OTHER_LIGHT * background.noise:
         return None
-    r = np.abs(difference - _of_light(comparable, background.noise))
-    there = seen & (background.known == 1)
-    wide = max(LEAST_DIFFERENCE * background.noise, float(r[there].mean()) if there.any() else 0.0)
-    x = u = background.known * _log_odds(r, background.noise, wide) + SEEN * seen
+    gain, offset = _light(difference, background.grey, background.noise, comparable)
+    r = np.abs(difference - gain * background.grey - offset)
+    there = seen & certain
+    wide = np.maximum(LEAST_DIFFERENCE * background.sigma, float(r[there].mean()) if there.any() else 0.0)
+    x = u = background.known * _log_odds(r, background.sigma, wide) + SEEN * seen
     for _ in range(ROUNDS):
         x = u + COUPLING * cv2.GaussianBlur(np.tanh(x / 2), (0, 0), RADIUS)  # (2)
     _, label, stats, _ = cv2.connectedComponentsWithStats((x > 0).astype(np.uint8))
@@ -150,15 +172,30 @@ def person(background: CellBackground, image: np.ndarray, seen: np.ndarray) -> n
     return np.asarray(large[label])
 
 
+def _light(difference: np.ndarray, grey: np.ndarray, noise: float, comparable: np.ndarray | slice = np.s_[:]) -> tuple[float, float]:
+    """What another light adds to the differences (h, w) from a background `grey`: gain · grey + offset, by least absolute residuals."""
+    d, g = difference[comparable].ravel(), grey[comparable].ravel()
+    every = 1 + len(d) // GAIN_CELLS
+    some, level = d[::every].astype(np.float64), g[::every].astype(np.float64)
+    level = level - level.mean()
+    gain, offset = 0.0, float(np.median(some))
+    for _ in range(GAIN_STEPS):
+        w = 1 / np.maximum(np.abs(some - offset - gain * level), noise)
+        m = (w * level).sum() / w.sum()
+        offset = float((w * some).sum() / w.sum() - gain * m)
+        gain = float((w * (level - m) * some).sum() / ((w * (level - m) ** 2).sum() + GAIN_PRIOR))
+    return gain, _of_light(d - gain * g, noise)
+
+
 def _of_light(difference: np.ndarray, noise: float) -> float:
     """What the light adds to all differences (N,): the mean of the tightest half of those not far from the noise."""
     near = np.sort(difference[np.abs(difference) < 2 * OTHER_LIGHT * noise])
     half = (len(near) + 1) // 2
     first = int(np.argmin(near[half - 1 :] - near[: len(near) - half + 1]))
-    return float(near[first : first + half].mean())
+    return float(near[first : first + half].mean()) if half else 0.0
 
 
-def _log_odds(r: np.ndarray, noise: float, wide: float) -> np.ndarray:
+def _log_odds(r: np.ndarray, noise: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """ln p(r | person) − ln p(r | background) of absolute differences (h, w).  (1)"""
     narrow = np.exp(-0.5 * (r / noise) ** 2) / (noise * np.sqrt(2 * np.pi))
     empty = (1 - STRAY) * narrow + STRAY * np.exp(-r / (2 * wide)) / (4 * wide)

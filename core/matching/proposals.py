@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.intersection import MOST_MISS_SIGMAS, Intersection, intersect_clicks
+from ..geometry.intersection import MOST_MISS_SIGMAS, Intersection, intersect_clicks, most_miss_px
 from .least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import approximations_at_depth, sweep_ray
 from .views import Views
@@ -122,7 +122,11 @@ def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray],
     The clicks' sigma enters the proposals' sigmas.
     """
     given = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
-    found = _where_rays_meet(cameras, given, MOST_MISS_SIGMAS * sigma_px) if len(given) > 1 else given
+    if len(given) > 1:
+        limit_px = float(most_miss_px(cameras, _intersected(cameras, given), sigma_px)[0])
+        found = _where_rays_meet(cameras, given, limit_px)
+    else:
+        found = given
     return tuple(found.get(k) if k not in clicks else None for k in range(len(cameras)))
 
 

@@ -22,7 +22,7 @@ from ..foundation import store
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..geometry.intersection import clicks_contradict, doubtful_view, intersect_clicks
+from ..geometry.intersection import doubtful_view, intersect_clicks, joint_clicks_contradict
 from ..networks.pose_network import PoseNetwork
 from ..take.footage import Footage
 from ..take.writing import read_table, write_table
@@ -145,7 +145,7 @@ def without_contradictions(footage: Footage, points: np.ndarray, sigma_px: np.nd
     for _ in range(V - 1):  # each round gives up one view of a point
         xy = np.where(used[..., None], kept[..., :2], np.nan).reshape(V, N * K, 2).transpose(1, 0, 2)
         several = used.reshape(V, -1).sum(axis=0) > 1
-        wrong = several & clicks_contradict(intersect_clicks(cameras, xy, sigma_px[None]), float(sigma_px.max()))
+        wrong = several & joint_clicks_contradict(cameras, intersect_clicks(cameras, xy, sigma_px[None]), float(sigma_px.max()))
         for row in np.flatnonzero(wrong).tolist():
             views = np.flatnonzero(np.isfinite(xy[row, :, 0]))
             out = [views[doubtful_view([cameras[v] for v in views], xy[row, views])]] if len(views) > 2 else views

@@ -23,6 +23,7 @@ from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_sk
 from ..body.skin.posed import Poser
 from ..body.skin.relief import MOST_FRAMES, SurfacePoints
 from ..body.skin.texture import TextureBaker
+from ..checking.rig_check import wide_findings
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
@@ -37,6 +38,7 @@ from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, of_model, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..geometry.view_angles import is_alone
 from ..matching.foreground import Foreground
 from ..motion.formats.ply import write_mesh
 from ..motion.tables import write_joints, write_motion
@@ -71,12 +73,17 @@ BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin", "outlines")  # of
 
 
 def measure(run: Run, monitor: Monitor) -> None:
-    """The surface of every frame: clouds/NNNN.ply. If nothing can be measured, outlines or keypoints may replace it, with a warning.
+    """The surface of every frame: clouds/NNNN.ply. If nothing can be measured, outlines or keypoints may replace it, with a warning; where
+    all views look from too far apart, that is not even tried for a body.
 
     Raises:
         InputError: the footage cannot be read, or nothing can be measured.
         Cancelled: the frames measured so far are kept.
     """
+    cameras, reference = run.footage.rig.cameras, run.footage.take.reference
+    if is_alone(cameras, reference) and not missing_for_fit(run.footage):
+        run.warn(*(finding.sentence for finding in wide_findings(cameras, reference)))
+        return run.do_without_surface("the views look from too far apart")
     began, summaries, kept, frames = time.perf_counter(), list[FrameSummary](), set[int](), run.footage.frames
     run.results.remove_other_clouds(frames)
     if run.settings["timing"].correct and not run.footage.delay_images:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..foundation.progress import Monitor
-from ..geometry.view_angles import WIDEST_DEG, neighbours_deg
+from ..geometry.view_angles import WIDEST_DEG, is_alone, neighbours_deg
 from ..results.folder import Results
 from ..take.footage import Footage
 from .measure import NothingMeasured, measure_frames
@@ -44,9 +44,9 @@ def other_beginning(footage: Footage, settings: MeasureSettings, results: Result
         InputError: the images cannot be read.
         Cancelled: the user asked to stop.
     """
-    first, degrees = first_frame(footage), neighbours_deg(footage.rig.cameras, footage.take.reference)
-    if degrees[0] > WIDEST_DEG:
+    if is_alone(footage.rig.cameras, footage.take.reference):
         return None
+    first, degrees = first_frame(footage), neighbours_deg(footage.rig.cameras, footage.take.reference)
     frames = _others(footage, settings, first)
     can_pair = len(degrees) > 1 and degrees[1] <= WIDEST_DEG and not settings.growing.pairs
     parts = len(frames) + can_pair * (1 + len(frames))

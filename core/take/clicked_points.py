@@ -7,7 +7,7 @@ of the reference view is therefore swept about that depth, within the clicks' ow
 import numpy as np
 
 from ..foundation.errors import InputError
-from ..geometry.intersection import Intersection, clicks_contradict, intersect_clicks
+from ..geometry.intersection import Intersection, doubtful_view, intersect_clicks, joint_clicks_contradict
 from ..matching.least_squares import MatchingSettings
 from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
 from ..matching.views import Views
@@ -38,9 +38,10 @@ def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
     point = intersect_clicks(cameras, xy, footage.click_sigma_px)
     if not 0 < cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2] < np.inf:
         raise InputError(f"“{name}” is clicked in {len(at)} view(s) and has no position in space. Click it in two views at least.")
-    if clicks_contradict(point, footage.click_sigma_px)[0]:
+    if joint_clicks_contradict(cameras, point, footage.click_sigma_px)[0]:
+        first = f"; look at view {cameras[doubtful_view(cameras, xy[0])].name} first" if point.rays[0] > 2 else ""
         raise InputError(
-            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px. Click the same spot in every view, "
+            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px. Click the same spot in every view{first}, "
             "and check that rig.toml belongs to this footage."
         )
     return point

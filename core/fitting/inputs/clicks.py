@@ -7,7 +7,7 @@ import numpy as np
 
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
-from ...geometry.intersection import Intersection, clicks_contradict, doubtful_view, intersect_clicks
+from ...geometry.intersection import Intersection, doubtful_view, intersect_clicks, joint_clicks_contradict
 from ...geometry.rig import Rig
 from ..observations import ClickedJoints, Observation
 from .fit_input import ClickedAt
@@ -72,7 +72,7 @@ def initial_clicks(xyz_m: np.ndarray, joint_names: Sequence[str], observations: 
 
 
 def _check_agreement(name: str, cameras: Sequence[Camera], xy_px: np.ndarray, point: Intersection, sigma_px: float) -> None:
-    if not clicks_contradict(point, sigma_px)[0]:
+    if not joint_clicks_contradict(cameras, point, sigma_px)[0]:
         return
     miss = np.nan_to_num(np.linalg.norm(point.residual_px[0], axis=1), nan=np.inf)
     worst = doubtful_view(cameras, xy_px) if len(cameras) > 2 else int(np.argmax(miss))

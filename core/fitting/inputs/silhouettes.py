@@ -16,7 +16,7 @@ import numpy as np
 
 from ...geometry.camera import Camera
 from ..observations import SilhouetteRays
-from ..segmentation import SegmentationCache, facing_bone, owners
+from ..segmentation import SegmentationCache, bone_spheres, facing_bone, owners
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
@@ -216,11 +216,21 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarra
         surface[:, 1] < 1
     )  # its outline continues in fingers, which are no bones
     last = np.where(has_fingers, surface[:, 1], last)
-    bones = np.unique(state.balls.bone_index)
-    rows, bone = np.repeat(np.arange(len(rays.direction)), len(bones)), np.tile(bones, len(rays.direction))
+    rows, bone = _near_pairs(rays, state, gate)
     X = nearest_to_segment(rays.origin_m[rows], rays.direction[rows], state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone])
     gap, along, facing = facing_bone(X, rays.outward[rows], state, bone)
     return owners(rows, bone, gap, (along >= first[bone]) & (along <= last[bone]) & facing & (np.abs(gap) < gate[bone]))
+
+
+def _near_pairs(rays: Rays, state: BodyState, reach_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a ray (K,) and a bone (K,) with balls, ordered by rays, whose sphere (`segmentation.bone_spheres`) the ray meets."""
+    bones = np.unique(state.balls.bone_index)
+    middle, radius = bone_spheres(state, reach_m, bones)
+    o, u = rays.origin_m, rays.direction
+    away = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ middle.T + np.einsum("bi,bi->b", middle, middle)
+    along = u @ middle.T - np.einsum("ni,ni->n", o, u)[:, None]
+    rows, column = np.nonzero(away - along**2 <= radius**2)
+    return rows, bones[column]
 
 
 def nearest_to_segment(origin: np.ndarray, direction: np.ndarray, head: np.ndarray, axis: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The first body: pose and shape at the click frame (D'Apuzzo et al. 1999, §3.3)."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -53,10 +52,10 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
         best, best_score = _better_around(fit, points, best, best_score, parts[-2])
     support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
     if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
-        if not fit.settings.use_surface:
+        if not len(points.xyz_m):
             raise InputError(
-                f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
-                "(fitting.use_surface=false) the body needs them; find outlines with `tricap contour`."
+                f"Frame {points.frame} has no measured surface, and no outlines near the clicked joints; check the clicks and the rig, or "
+                "find outlines with `tricap contour`."
             )
         raise InputError(
             f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
@@ -67,10 +66,9 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
 
 def _shaped(fit: FitContext, points: CloudPoints, found: Solution, vector: np.ndarray, monitor: Monitor) -> Solution:
     """The solution with its shape adjusted anew from a vector (S,), without outlines against the background, where the points suffice."""
-    exact = replace(fit, silhouettes=fit.silhouettes.drawn_only())
-    if not fit.background.known or not fit.settings.use_surface:
+    if not fit.background.known or not len(points.xyz_m):
         return found
-    again = _to_surface(exact, points, found.motion[0], vector, monitor)
+    again = _to_surface(fit.shaped_by(points), points, found.motion[0], vector, monitor)
     least = fit.score(fit.click, points, found.motion[0], found.vector) * KEPT_SCORE
     return again if fit.score(fit.click, points, again.motion[0], again.vector) > least else found
 

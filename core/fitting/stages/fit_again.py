@@ -123,13 +123,14 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         places=places,
         tracks=JointTracks(given, names),
     )
-    fit = replace(fit, monitor=monitor, silhouettes=fit.silhouettes.drawn_only())
+    points = [thinned(cloud, settings.voxel_m) for cloud in given.clouds]
+    fit = replace(fit, monitor=monitor).shaped_by(points[len(points) // 2])
     observed = np.ones(earlier.values.shape, dtype=bool)
     tracked = settings.use_trajectories and given.trajectories is not None
     whole = Recording(
         fit=fit,
         frames=given.frames,
-        points=[thinned(cloud, settings.voxel_m) for cloud in given.clouds],
+        points=points,
         time_s=given.time_s,
         sigma=acceleration_sigmas(fit, earlier.values, observed, earlier.time_s),
         tracks=MaterialTracks(given.trajectories, given.frames, model.surface, settings) if tracked and given.trajectories else None,

@@ -5,7 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.geometry.intersection import clicks_contradict, doubtful_view, forward_intersection, intersect_clicks
+from tricap.core.geometry.intersection import (
+    JOINT_PLACE_M,
+    clicks_contradict,
+    doubtful_view,
+    forward_intersection,
+    intersect_clicks,
+    joint_clicks_contradict,
+)
 
 
 def cloud(n: int, seed: int = 0) -> np.ndarray:
@@ -99,6 +106,26 @@ def test_clicks_that_contradict_each_other_by_their_own_sigma(scenes: Any) -> No
             assert low <= share <= high
     point = intersect_clicks(cameras[:2], np.full((1, 2, 2), np.nan))
     assert clicks_contradict(point).tolist() == [True], "no rays, no point"
+
+
+@pytest.mark.parametrize(("base_m", "low", "high"), [(0.2, 0.1, 1.0), (6.0, 0.0, 0.005)])
+def test_a_joint_may_be_believed_elsewhere_from_another_side_but_not_from_beside(
+    scenes: Any, base_m: float, low: float, high: float
+) -> None:
+    cameras, rng, n = (
+        scenes.three_cameras(base_m=base_m, focal=2000.0 * max(1.0, base_m), distorted=False).cameras,
+        np.random.default_rng(5),
+        3000,
+    )
+    X = cloud(n)
+    believed = X[:, None] + rng.normal(0, JOINT_PLACE_M, (n, 3, 3))
+    xy = np.stack([camera.project(believed[:, k]) for k, camera in enumerate(cameras)], axis=1)
+    share = joint_clicks_contradict(cameras, intersect_clicks(cameras, xy, 5.0), 5.0).mean()
+    assert low <= share <= high
+    if base_m > 1:
+        assert clicks_contradict(intersect_clicks(cameras, xy, 5.0), 5.0).mean() > 0.5, "a spot on the surface may not"
+    nothing = intersect_clicks(cameras[:2], np.full((1, 2, 2), np.nan))
+    assert joint_clicks_contradict(cameras[:2], nothing).tolist() == [True], "no rays, no point"
 
 
 def test_the_view_to_look_at_first(scenes: Any) -> None:

@@ -63,10 +63,21 @@ def test_a_person_in_cloth_as_bright_as_the_wall_is_found_about_a_few_measured_p
     true, seen = _ellipse(70), np.zeros(SIZE, dtype=bool)
     seen[20:72:4, 60:82:3] = True
     assert abs(float((plain - WALL)[true].mean())) < 0.5 and (np.abs(plain - WALL)[true] < 2 * NOISE).mean() > 0.7
-    background = _background(images)
+    background = _background(images, near=[_near(x) for x in np.linspace(20, 120, len(images))])
     found = person(background, images[6], seen & true)
     assert _iou(found, true) > 0.8 and not np.asarray(found)[:, :40].any()
     assert _iou(person(background, images[6], NOBODY), true) < 0.7
+
+
+@pytest.mark.parametrize("drift", [0.0, 8.0])
+def test_a_person_in_light_that_gets_brighter_and_before_a_lamp_that_drifts(drift: float) -> None:
+    """The exposure grows by 8 % before a wall that is bright on one side; about a lamp, there are up to 8 grey values more."""
+    share, i = np.linspace(-0.5, 0.5, 13), np.indices(SIZE)[1]
+    ramp, lamp = 0.8 * (i - 70), drift * np.exp(-(((i - 130) / 30) ** 2))
+    images = [np.float32((1 + 0.08 * s) * (image + ramp) + s * lamp) for s, image in zip(share, _walk(110 + PRINT))]
+    background = _background(images)
+    for t, x in ((0, 20), (6, 70), (12, 120)):
+        assert _iou(person(background, images[t], NOBODY), _ellipse(x)) > 0.9
 
 
 @pytest.mark.parametrize("told", [False, True])
@@ -176,6 +187,8 @@ def test_the_noise_of_a_given_background_is_that_of_the_images_that_show_it(nois
 def test_a_bright_person_before_a_background_without_noise() -> None:
     """The probability of the background is then smaller than any number: its logarithm must not be taken."""
     image = np.where(_ellipse(70), np.float32(255), np.float32(0))
-    background = CellBackground(grey=np.zeros(SIZE, np.float32), noise=0.02, known=np.ones(SIZE), cell_px=4)
+    background = CellBackground(
+        grey=np.zeros(SIZE, np.float32), noise=0.02, sigma=np.full(SIZE, 0.02, np.float32), known=np.ones(SIZE), cell_px=4
+    )
     with np.errstate(divide="raise", over="raise"):
         assert _iou(person(background, image, NOBODY), _ellipse(70)) > 0.95

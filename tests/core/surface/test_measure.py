@@ -215,7 +215,8 @@ def test_clicks_that_have_no_place_in_space(plane_take: Path, tmp_path: Path, sc
     for i, (at, said) in enumerate(
         (
             ("{ L = [100.0, 75.0] }", "is clicked in 1 view.* Click it in two views at least"),
-            ("{ L = [100.0, 60.0], C = [100.0, 95.0] }", "miss each other by .* px. Click the same spot in every view"),
+            ("{ L = [100.0, 60.0], C = [100.0, 95.0] }", "miss each other by .* px. Click the same spot in every view, and check"),
+            ("{ L = [100.0, 140.0], C = [100.0, 75.0], R = [100.0, 75.0] }", "in every view; look at view L first, and check"),
             ("{ L = [0.0, 75.0], C = [199.0, 75.0] }", "has no position in space"),  # rays that diverge
         )
     ):
