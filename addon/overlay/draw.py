@@ -10,7 +10,7 @@ import numpy as np
 from ..session import get_session
 from . import canvas, layers, results
 from .canvas import Canvas, Colour
-from .layers import Inspection
+from .layers import Inspection, Pulled
 from .results import RunResults
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ CURRENT_FRAME: Colour = (0.3, 0.6, 1.0, 1.0)
 PROBLEM: Colour = (1.0, 0.25, 0.2, 1.0)
 CORRECTION: Colour = (1.0, 0.25, 0.2, 1.0)
 ACTIVE_CORRECTION: Colour = (1.0, 0.85, 0.3, 1.0)
+PULLED: Colour = (0.3, 1.0, 0.45, 1.0)
+PULLED_BONES: Colour = (0.3, 1.0, 0.45, 0.6)
 GRAPH_PX = 90.0  # height
 CURVES: tuple[tuple[str, str, Colour], ...] = (
     ("residual_px", "residual [px]", (1.0, 0.8, 0.3, 1.0)),
@@ -53,6 +55,11 @@ def show_region(view: str, corners: Sequence[tuple[float, float]]) -> None:
     get_session().file.region_corners = (view, list(corners))
 
 
+def show_pulled(pulled: Pulled | None) -> None:
+    """Show a limb whose joint is being dragged, in all views."""
+    get_session().file.pulled = pulled
+
+
 def begin() -> None:
     """Add the draw handler."""
     get_session().overlay_handle = bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
@@ -75,6 +82,7 @@ def _draw() -> None:
         if run is not None and view in run.cameras:
             draw_overlays(run, scene.tricap_overlay, view, scene.frame_current, sheet, playing=context.screen.is_animation_playing)
     draw_corrections(scene.tricap_correcting, view, scene.frame_current, sheet)
+    draw_pulled(get_session().file.pulled, view, scene.frame_current, sheet)
 
 
 def is_anything_shown(shown: Any, frame: int) -> bool:
@@ -280,3 +288,16 @@ def draw_corrections(correcting: Any, view: str, frame: int, sheet: Canvas) -> N
         corners = sheet.to_region(np.array(clicked))
         dots = [canvas.ring(corner, 4.0, 8) for corner in corners]
         canvas.draw_lines(canvas.line_batch(np.concatenate([canvas.chain(corners), *dots])), 2.0, ACTIVE_CORRECTION)
+
+
+def draw_pulled(pulled: Pulled | None, view: str, frame: int, sheet: Canvas) -> None:
+    """Draw the limb whose joint is being dragged as it would be: its bones, the outline of its skin, and a line to where it was fitted."""
+    if pulled is None or pulled.frame != frame or view not in pulled.joint_px:
+        return
+    with sheet.image_space():
+        for segments, width, colour in ((pulled.bones_px, 1.5, PULLED_BONES), (pulled.outline_px, 2.0, PULLED)):
+            if len(segments[view]):
+                canvas.draw_lines(canvas.line_batch(segments[view]), width, colour)
+    fitted, now = sheet.to_region(pulled.joint_px[view])
+    canvas.draw_lines(canvas.line_batch(np.concatenate([[(fitted, now)], canvas.ring(now, 5.0, 12)])), 2.0, ACTIVE_CORRECTION)
+    canvas.text(pulled.name, now[0] + 9.0, now[1] + 6.0, ACTIVE_CORRECTION, size=12)
