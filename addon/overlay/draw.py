@@ -22,7 +22,6 @@ CONTOUR: Colour = (0.95, 0.3, 0.95, 1.0)
 NO_EDGE: Colour = (0.95, 0.3, 0.95, 0.35)
 START_BOX: Colour = (0.9, 0.9, 0.9, 0.8)
 MATCHED: Colour = (0.3, 1.0, 0.45, 1.0)
-BACKING: Colour = (0.05, 0.05, 0.05, 0.65)
 WHITE: Colour = (1.0, 1.0, 1.0, 1.0)
 CURRENT_FRAME: Colour = (0.3, 0.6, 1.0, 1.0)
 PROBLEM: Colour = (1.0, 0.25, 0.2, 1.0)
@@ -218,7 +217,7 @@ def _draw_colour_scale(run: RunResults, view: str, frame: int, red_mm: float, sh
     scale = bpy.context.preferences.system.ui_scale
     width, height = 120 * scale, 10 * scale
     x, y = sheet.region.width - width - 60 * scale, sheet.region.height - 60 * scale
-    canvas.fill(canvas.rectangle(x - 10 * scale, y - 20 * scale, width + 30 * scale, height + 28 * scale), BACKING)
+    canvas.fill(canvas.rectangle(x - 10 * scale, y - 20 * scale, width + 30 * scale, height + 28 * scale), canvas.BACKING)
     for i in range(24):
         colour = layers.heat_colours(np.array([(i + 0.5) / 24]))[0]
         canvas.fill(canvas.rectangle(x + i * width / 24, y, width / 24 + 0.5, height), tuple(colour))
@@ -239,7 +238,7 @@ def _draw_graph(run: RunResults, frame: int, sheet: Canvas) -> None:
     table = run.table()
     scale = bpy.context.preferences.system.ui_scale
     left, bottom, width, height = 14 * scale, 34 * scale, sheet.region.width - 28 * scale, GRAPH_PX * scale
-    canvas.fill(canvas.rectangle(left - 6 * scale, bottom - 16 * scale, width + 12 * scale, height + 36 * scale), BACKING)
+    canvas.fill(canvas.rectangle(left - 6 * scale, bottom - 16 * scale, width + 12 * scale, height + 36 * scale), canvas.BACKING)
     if table is None or not len(table.frames):
         canvas.text("The results have no table of frames; run again to see the graph.", left, bottom + height / 2, PROBLEM, size=12)
         return
