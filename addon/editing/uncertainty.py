@@ -1,5 +1,6 @@
 """How well the body's places are known, on demand: strips for trunk and limbs at the lower edge of the timeline, Dope Sheet and Graph
-Editor, and bones coloured in the 3-D view, both with a legend. The colours are those of the report: blue up to a millimetre, red from 5 cm.
+Editor, and bones coloured in the 3-D view; with a legend, except in a low timeline. The colours are those of the report: blue up to a
+millimetre, red from 5 cm.
 """
 
 import re
@@ -16,6 +17,7 @@ from .curves import keys_of, sigma_curves
 
 STRIP_PX, RULER_PX, OPACITY, BONE_PX = 11.0, 26.0, 0.9, 6.0  # the ruler with the frames stays free
 LEGEND_PX, MARGIN_PX, SHADES = 150.0, 14.0, 48
+HIGH_PX = 160.0  # an editor in which there is room for a legend over the strips
 TITLE = "Sigma of the joints"
 LACKING = "This body has no sigmas of its joints: press Build Rig and Scene again"
 CONTROL = re.compile(r"_(fk|ik)(?=\.|$)")  # of the names of controls
@@ -114,6 +116,8 @@ def _draw_strip() -> None:
         y += STRIP_PX * scale
     if not sigmas:
         canvas.text(LACKING, MARGIN_PX * scale, 4 * scale, size=11)
+    elif region.height > HIGH_PX * scale:
+        _draw_colours(region.width - (LEGEND_PX + 2 * MARGIN_PX) * scale, y + MARGIN_PX * scale)
 
 
 def _draw_row(region: bpy.types.Region, frames: np.ndarray, sigma_mm: np.ndarray, y: float, height: float) -> None:
@@ -164,5 +168,10 @@ def _draw_legend() -> None:
     if not found[1]:
         canvas.text(LACKING, x - width / 2, y, size=11)
         return
+    _draw_colours(x, y)
+
+
+def _draw_colours(x: float, y: float) -> None:
     shades = sigma_colours(np.geomspace(SIGMAS_MM[0], SIGMAS_MM[-1], SHADES)) / 255
+    width = LEGEND_PX * bpy.context.preferences.system.ui_scale
     canvas.colour_bar(shades, [f"{value:g} mm" for value in SIGMAS_MM], TITLE, x, y, width)
