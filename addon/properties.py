@@ -170,8 +170,8 @@ def _of_what_is_shown() -> dict[str, Any]:
             name="Show Uncertainty",
             options=set(),
             update=lambda _, context: uncertainty.redraw(context),
-            description="Colour the bones in the 3-D view, and a strip in the timeline, by the sigmas of the motion: green up to 1°, "
-            "red from 10°. In Pose Mode the strip is of the selected bones",
+            description="Colour the bones in the 3-D view, and strips of trunk and limbs in the timeline, by how well their joints "
+            "are known: blue up to 1 mm, red from 50 mm. In Pose Mode the strip is of the selected bones",
         ),
         "foot_lock": bpy.props.BoolProperty(
             name="Foot Lock",

@@ -50,6 +50,7 @@ class FileState:
     uncertainty: tuple[Any, Any] = ((), None)  # what is shown of the body's motion: its key, and the sigmas by bone
     correcting: bool = False  # a modal operator of the corrections runs
     region_corners: tuple[str, list[tuple[float, float]]] = ("", [])  # the view, and the corners clicked so far
+    pulled: Any = None  # the limb whose joint is being dragged (overlay.layers.Pulled)
 
 
 def _set() -> Event:

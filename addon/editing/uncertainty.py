@@ -1,60 +1,64 @@
-"""The uncertainty of the body's motion, on demand: a coloured strip at the lower edge of the timeline, Dope Sheet and Graph Editor, and
-bones coloured by their sigma in the 3-D view. Colours: green where certain, by yellow to red at 10°.
+"""How well the body's places are known, on demand: strips for trunk and limbs at the lower edge of the timeline, Dope Sheet and Graph
+Editor, and bones coloured in the 3-D view; with a legend, except in a low timeline. The colours are those of the report: blue up to a
+millimetre, red from 5 cm.
 """
 
 import re
+from collections.abc import Collection
 
 import bpy
 import numpy as np
 
+from ...core.body.sigma_colours import SIGMAS_MM, sigma_colours
 from ..overlay import canvas
 from ..scene import standing
-from ..scene.action import METRES_PER_RADIAN
 from ..session import get_session
-from .curves import BONE, keys_of, sigma_curves
+from .curves import keys_of, sigma_curves
 
-GREEN_DEG, RED_DEG = 1.0, 10.0
-QUARTILE = 0.75
-STRIP_PX, OPACITY, BONE_PX = 8.0, 0.9, 6.0
+STRIP_PX, RULER_PX, OPACITY, BONE_PX = 11.0, 26.0, 0.9, 6.0  # the ruler with the frames stays free
+LEGEND_PX, MARGIN_PX, SHADES = 150.0, 14.0, 48
+HIGH_PX = 160.0  # an editor in which there is room for a legend over the strips
+TITLE = "Sigma of the joints"
+LACKING = "This body has no sigmas of its joints: press Build Rig and Scene again"
 CONTROL = re.compile(r"_(fk|ik)(?=\.|$)")  # of the names of controls
 EDITORS = ("SpaceDopeSheetEditor", "SpaceGraphEditor")
 
-Sigmas = dict[str, tuple[np.ndarray, np.ndarray]]  # by bone: frames (T,), and the largest sigma (T,) of its channels [degrees]
+Sigmas = dict[str, tuple[np.ndarray, np.ndarray]]  # by bone: frames (T,), and how well its place is known in them (T,) [mm]
 
 
 def sigmas_of(body: bpy.types.Object) -> Sigmas:
-    """The sigmas of a body's bones; those of locations count as angles (METRES_PER_RADIAN)."""
-    found: Sigmas = {}
-    dofs = standing.dofs_of(body)
-    for name, curve in sigma_curves(body).items():
-        at = BONE.match(curve.data_path)
-        if at is None or not len(curve.keyframe_points):
-            continue
-        frames, sigma = keys_of(curve)
-        in_metres = dofs.get(name.removeprefix("sigma "), {}).get("path") == "location"
-        sigma = np.degrees(sigma / (METRES_PER_RADIAN if in_metres else 1.0))
-        before = found.get(at[1])
-        found[at[1]] = (frames, np.maximum(before[1], sigma) if before is not None and len(before[1]) == len(sigma) else sigma)
-    return found
+    """How well the places of a body's bones are known; empty where a scene of an earlier version does not have it."""
+    curves = sigma_curves(body)
+    named = {bone.name: curves[f"sigma {bone.name}"] for bone in body.pose.bones if f"sigma {bone.name}" in curves}
+    keys = {name: keys_of(curve) for name, curve in named.items() if len(curve.keyframe_points)}
+    return {name: (frames, 1e3 * sigma) for name, (frames, sigma) in keys.items()}
 
 
-def colour_of(sigma_deg: np.ndarray) -> np.ndarray:
+def colour_of(sigma_mm: np.ndarray) -> np.ndarray:
     """Colours (N, 4) of sigmas (N,)."""
-    part = np.clip(np.log(np.maximum(sigma_deg, 1e-6) / GREEN_DEG) / np.log(RED_DEG / GREEN_DEG), 0.0, 1.0)
-    red, green = np.minimum(1.0, 2 * part), np.minimum(1.0, 2 - 2 * part)
-    return np.stack([0.9 * red, 0.75 * green, np.full(len(part), 0.1), np.full(len(part), OPACITY)], axis=1)
+    return np.concatenate([sigma_colours(sigma_mm) / 255, np.full((len(sigma_mm), 1), OPACITY)], axis=1)
 
 
-def of_frames(sigmas: Sigmas, bones: set[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (T,) and in each the largest sigma (T,) of some bones; of all bones, if none of these has one, the sigma that a quarter of
-    them exceeds, because some bone is uncertain in nearly every frame."""
+def of_frames(sigmas: Sigmas, bones: Collection[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (T,) and in each the largest sigma (T,) of some bones."""
     chosen = [sigmas[name] for name in bones if name in sigmas]
-    part, chosen = (1.0, chosen) if chosen else (QUARTILE, list(sigmas.values()))
     frames = np.unique(np.concatenate([at for at, _ in chosen])) if chosen else np.zeros(0)
     values = np.zeros((len(chosen), len(frames)))
     for row, (at, sigma) in enumerate(chosen):
         values[row, np.searchsorted(frames, at)] = sigma
-    return frames, np.quantile(values, part, axis=0) if chosen else np.zeros(0)
+    return frames, values.max(axis=0, initial=0.0)
+
+
+def strips(body: bpy.types.Object, sigmas: Sigmas, chosen: Collection[str], most: int) -> dict[str, list[str]]:
+    """The bones of each strip by its name, lowest first: those that are chosen, or else trunk and limbs, as in the bone collections; the
+    whole body where there is no room for so many strips."""
+    if any(name in sigmas for name in chosen):
+        return {"Selected bones": [name for name in chosen if name in sigmas]}
+    found: dict[str, list[str]] = {}
+    for group in body.data.collections:
+        if names := [bone.name for bone in group.bones if bone.name in sigmas]:
+            found[group.name] = names
+    return dict(reversed(found.items())) if len(found) <= most else {"Least known": list(sigmas)}
 
 
 def begin() -> None:
@@ -63,7 +67,8 @@ def begin() -> None:
     for editor in EDITORS:
         space = getattr(bpy.types, editor)
         handles.append((space, space.draw_handler_add(_draw_strip, (), "WINDOW", "POST_PIXEL")))
-    handles.append((bpy.types.SpaceView3D, bpy.types.SpaceView3D.draw_handler_add(_draw_bones, (), "WINDOW", "POST_VIEW")))
+    for draw, when in ((_draw_bones, "POST_VIEW"), (_draw_legend, "POST_PIXEL")):
+        handles.append((bpy.types.SpaceView3D, bpy.types.SpaceView3D.draw_handler_add(draw, (), "WINDOW", when)))
 
 
 def end() -> None:
@@ -103,12 +108,26 @@ def _draw_strip() -> None:
     if found is None:
         return
     body, sigmas = found
-    frames, worst = of_frames(sigmas, chosen_bones(body))
-    height, to_region = STRIP_PX * bpy.context.preferences.system.ui_scale, region.view2d.view_to_region
-    for frame, colour in zip(frames, colour_of(worst)):
-        left, right = (to_region(frame + half, 0.0, clip=False)[0] for half in (-0.5, 0.5))
-        if right >= 0 and left <= region.width:
-            canvas.fill(canvas.rectangle(left, 0.0, max(right - left, 1.0), height), tuple(colour))
+    scale, y = bpy.context.preferences.system.ui_scale, 0.0
+    most = int((region.height / scale - RULER_PX) // STRIP_PX)
+    for name, bones in strips(body, sigmas, chosen_bones(body), most).items():
+        _draw_row(region, *of_frames(sigmas, bones), y, (STRIP_PX - 1.0) * scale)
+        canvas.text(name, 4 * scale, y + 1.5 * scale, size=9)
+        y += STRIP_PX * scale
+    if not sigmas:
+        canvas.text(LACKING, MARGIN_PX * scale, 4 * scale, size=11)
+    elif region.height > HIGH_PX * scale:
+        _draw_colours(region.width - (LEGEND_PX + 2 * MARGIN_PX) * scale, y + MARGIN_PX * scale)
+
+
+def _draw_row(region: bpy.types.Region, frames: np.ndarray, sigma_mm: np.ndarray, y: float, height: float) -> None:
+    left, right = (region.view2d.region_to_view(x, 0.0)[0] for x in (0.0, region.width))
+    seen = np.flatnonzero((frames > left - 1) & (frames < right + 1))
+    if not len(seen):
+        return
+    pixels = region.width / (right - left)
+    boxes = np.concatenate([canvas.rectangle((frame - 0.5 - left) * pixels, y, max(pixels, 1.0), height) for frame in frames[seen]])
+    canvas.fill_each(boxes, np.repeat(colour_of(sigma_mm[seen]), 2, axis=0))
 
 
 def chosen_bones(body: bpy.types.Object) -> set[str]:
@@ -137,3 +156,22 @@ def _draw_bones() -> None:
     ends, sigma = bones_drawn(*found, bpy.context.scene.frame_current)
     if len(ends):
         canvas.draw_lines_in_space(ends, colour_of(sigma), BONE_PX)
+
+
+def _draw_legend() -> None:
+    found = _shown()
+    if found is None or not bpy.context.space_data.overlay.show_overlays:
+        return
+    scale, region = bpy.context.preferences.system.ui_scale, bpy.context.region
+    width, y = LEGEND_PX * scale, MARGIN_PX * scale
+    x = (region.width - width) / 2  # tools and sidebar may lie over both edges
+    if not found[1]:
+        canvas.text(LACKING, x - width / 2, y, size=11)
+        return
+    _draw_colours(x, y)
+
+
+def _draw_colours(x: float, y: float) -> None:
+    shades = sigma_colours(np.geomspace(SIGMAS_MM[0], SIGMAS_MM[-1], SHADES)) / 255
+    width = LEGEND_PX * bpy.context.preferences.system.ui_scale
+    canvas.colour_bar(shades, [f"{value:g} mm" for value in SIGMAS_MM], TITLE, x, y, width)

@@ -33,7 +33,8 @@ FRONT = Quaternion((1.0, 0.0, 0.0), math.pi / 2)  # of a view along +y
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
-    """Build the results of a run in this scene: cameras with footage, point cloud, trajectories, armature, action and skin"""
+    """Build the results of a run in this scene: cameras with footage, point cloud, trajectories, armature, action and skin. The bones
+    shoulder.L and shoulder.R are the clavicles, as in Rigify"""
 
     bl_idname = "tricap.build_scene"
     bl_label = "Build Scene"

@@ -18,6 +18,7 @@ from ..scene import axes
 
 Colour = tuple[float, float, float, float]
 TEXT_PX = 13
+BACKING: Colour = (0.05, 0.05, 0.05, 0.65)  # under text and graphs
 
 
 class Canvas:
@@ -118,6 +119,21 @@ def draw_lines(batch: gpu.types.GPUBatch, width: float, colour: Colour | None = 
     batch.draw(shader)
 
 
+def colour_bar(colours: np.ndarray, labels: Sequence[str], title: str, x: float, y: float, width: float) -> None:
+    """A legend on a dark ground: colours (N, 3) 0 to 1 from left to right, labels below at equal distances, the title above. (x, y) is its
+    lower left corner."""
+    scale = bpy.context.preferences.system.ui_scale
+    bar_y, height = y + 18 * scale, 8 * scale
+    pad = 8 * scale
+    fill(rectangle(x - pad, y - 2 * scale, width + 2 * pad, 48 * scale), BACKING)
+    for i, colour in enumerate(colours):
+        fill(rectangle(x + i * width / len(colours), bar_y, width / len(colours) + 0.5, height), (*map(float, colour), 1.0))
+    for i, label in enumerate(labels):
+        room = width - text_width(label, size=11)
+        text(label, x + room * i / max(len(labels) - 1, 1), y + 4 * scale, size=11)
+    text(title, x, bar_y + height + 6 * scale, size=11)
+
+
 def draw_lines_in_space(segments_m: np.ndarray, colours: np.ndarray, width: float) -> None:
     """Draw segments (M, 2, 3) of the world with colours (M, 4), in the 3-D view, in front of everything."""
     shader = gpu.shader.from_builtin("POLYLINE_FLAT_COLOR")
@@ -147,6 +163,15 @@ def fill(triangles: np.ndarray, colour: Colour) -> None:
     position[:, :2] = np.asarray(triangles, dtype=np.float32).reshape(-1, 2)
     shader.uniform_float("color", colour)
     batch_for_shader(shader, "TRIS", {"pos": position}).draw(shader)
+
+
+def fill_each(triangles: np.ndarray, colours: np.ndarray) -> None:
+    """Draw triangles (N, 3, 2), each in its colour (N, 4), at once."""
+    position = np.zeros((3 * len(triangles), 3), dtype=np.float32)
+    position[:, :2] = triangles.reshape(-1, 2)
+    each = np.repeat(colours, 3, axis=0).astype(np.float32)
+    shader = gpu.shader.from_builtin("FLAT_COLOR")
+    batch_for_shader(shader, "TRIS", {"pos": position, "color": each}).draw(shader)
 
 
 def rectangle(x: float, y: float, width: float, height: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from ..session import get_session
 from . import canvas, layers, results
 from .canvas import Canvas, Colour
-from .layers import Inspection
+from .layers import Inspection, Pulled
 from .results import RunResults
 
 if TYPE_CHECKING:
@@ -22,12 +22,13 @@ CONTOUR: Colour = (0.95, 0.3, 0.95, 1.0)
 NO_EDGE: Colour = (0.95, 0.3, 0.95, 0.35)
 START_BOX: Colour = (0.9, 0.9, 0.9, 0.8)
 MATCHED: Colour = (0.3, 1.0, 0.45, 1.0)
-BACKING: Colour = (0.05, 0.05, 0.05, 0.65)
 WHITE: Colour = (1.0, 1.0, 1.0, 1.0)
 CURRENT_FRAME: Colour = (0.3, 0.6, 1.0, 1.0)
 PROBLEM: Colour = (1.0, 0.25, 0.2, 1.0)
 CORRECTION: Colour = (1.0, 0.25, 0.2, 1.0)
 ACTIVE_CORRECTION: Colour = (1.0, 0.85, 0.3, 1.0)
+PULLED: Colour = (0.3, 1.0, 0.45, 1.0)
+PULLED_BONES: Colour = (0.3, 1.0, 0.45, 0.6)
 GRAPH_PX = 90.0  # height
 CURVES: tuple[tuple[str, str, Colour], ...] = (
     ("residual_px", "residual [px]", (1.0, 0.8, 0.3, 1.0)),
@@ -53,6 +54,11 @@ def show_region(view: str, corners: Sequence[tuple[float, float]]) -> None:
     get_session().file.region_corners = (view, list(corners))
 
 
+def show_pulled(pulled: Pulled | None) -> None:
+    """Show a limb whose joint is being dragged, in all views."""
+    get_session().file.pulled = pulled
+
+
 def begin() -> None:
     """Add the draw handler."""
     get_session().overlay_handle = bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
@@ -75,6 +81,7 @@ def _draw() -> None:
         if run is not None and view in run.cameras:
             draw_overlays(run, scene.tricap_overlay, view, scene.frame_current, sheet, playing=context.screen.is_animation_playing)
     draw_corrections(scene.tricap_correcting, view, scene.frame_current, sheet)
+    draw_pulled(get_session().file.pulled, view, scene.frame_current, sheet)
 
 
 def is_anything_shown(shown: Any, frame: int) -> bool:
@@ -210,7 +217,7 @@ def _draw_colour_scale(run: RunResults, view: str, frame: int, red_mm: float, sh
     scale = bpy.context.preferences.system.ui_scale
     width, height = 120 * scale, 10 * scale
     x, y = sheet.region.width - width - 60 * scale, sheet.region.height - 60 * scale
-    canvas.fill(canvas.rectangle(x - 10 * scale, y - 20 * scale, width + 30 * scale, height + 28 * scale), BACKING)
+    canvas.fill(canvas.rectangle(x - 10 * scale, y - 20 * scale, width + 30 * scale, height + 28 * scale), canvas.BACKING)
     for i in range(24):
         colour = layers.heat_colours(np.array([(i + 0.5) / 24]))[0]
         canvas.fill(canvas.rectangle(x + i * width / 24, y, width / 24 + 0.5, height), tuple(colour))
@@ -231,7 +238,7 @@ def _draw_graph(run: RunResults, frame: int, sheet: Canvas) -> None:
     table = run.table()
     scale = bpy.context.preferences.system.ui_scale
     left, bottom, width, height = 14 * scale, 34 * scale, sheet.region.width - 28 * scale, GRAPH_PX * scale
-    canvas.fill(canvas.rectangle(left - 6 * scale, bottom - 16 * scale, width + 12 * scale, height + 36 * scale), BACKING)
+    canvas.fill(canvas.rectangle(left - 6 * scale, bottom - 16 * scale, width + 12 * scale, height + 36 * scale), canvas.BACKING)
     if table is None or not len(table.frames):
         canvas.text("The results have no table of frames; run again to see the graph.", left, bottom + height / 2, PROBLEM, size=12)
         return
@@ -280,3 +287,16 @@ def draw_corrections(correcting: Any, view: str, frame: int, sheet: Canvas) -> N
         corners = sheet.to_region(np.array(clicked))
         dots = [canvas.ring(corner, 4.0, 8) for corner in corners]
         canvas.draw_lines(canvas.line_batch(np.concatenate([canvas.chain(corners), *dots])), 2.0, ACTIVE_CORRECTION)
+
+
+def draw_pulled(pulled: Pulled | None, view: str, frame: int, sheet: Canvas) -> None:
+    """Draw the limb whose joint is being dragged as it would be: its bones, the outline of its skin, and a line to where it was fitted."""
+    if pulled is None or pulled.frame != frame or view not in pulled.joint_px:
+        return
+    with sheet.image_space():
+        for segments, width, colour in ((pulled.bones_px, 1.5, PULLED_BONES), (pulled.outline_px, 2.0, PULLED)):
+            if len(segments[view]):
+                canvas.draw_lines(canvas.line_batch(segments[view]), width, colour)
+    fitted, now = sheet.to_region(pulled.joint_px[view])
+    canvas.draw_lines(canvas.line_batch(np.concatenate([[(fitted, now)], canvas.ring(now, 5.0, 12)])), 2.0, ACTIVE_CORRECTION)
+    canvas.text(pulled.name, now[0] + 9.0, now[1] + 6.0, ACTIVE_CORRECTION, size=12)

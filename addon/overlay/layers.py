@@ -40,6 +40,18 @@ class Inspection:
     matched_boxes: dict[str, np.ndarray]  # (4, 2) by view
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pulled:
+    """A joint that is being dragged in a frame, and what moves with it, by view: bones (K, 2, 2), the outline of their skin (N, 2, 2), and
+    the joint (2, 2) where it was fitted and where it is now."""
+
+    name: str
+    frame: int
+    bones_px: dict[str, np.ndarray]
+    outline_px: dict[str, np.ndarray]
+    joint_px: dict[str, np.ndarray]
+
+
 def heat_colours(value: np.ndarray) -> np.ndarray:
     """Colours (N, 4) of 0 (blue) to 1 (red)."""
     at = np.clip(np.nan_to_num(value), 0.0, 1.0) * (len(HEAT_COLOURS) - 1)

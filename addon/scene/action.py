@@ -1,7 +1,8 @@
 """The motion as an action: an F-curve for each DOF with a key in every frame, in groups by bone.
 
 The sigmas are an action of their own, in a locked NLA track below, so that the channels to edit are not among them. The sigma of a DOF is
-a custom property of its bone ("sigma elbow.R flexion"), in the unit of its channel: radians, or metres for the base.
+a custom property of its bone ("sigma elbow.R flexion"), in the unit of its channel: radians, or metres for the base. That of a bone's
+place ("sigma forearm.R", metres) is the larger one of the joints at its ends, without what is common to all frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
 from ...core.motion.retarget.rig import needed_keys
+from ...core.motion.tables import JointTable
 from . import armature
 from .standing import DOFS_KEY, MEASURED_KEY, Standing
 
@@ -29,11 +31,16 @@ def add_action(
     values: np.ndarray,
     sigma: np.ndarray,
     stand: Standing | None = None,
+    place_sigma: Mapping[str, np.ndarray] | None = None,
 ) -> bpy.types.Action:
-    """Key the armature with the motion: frames (T,), values and sigma (T, D) in radians and metres. NaN gets no key."""
+    """Key the armature with the motion: frames (T,), values and sigma (T, D) in radians and metres. NaN gets no key.
+
+    `place_sigma` (T,) [m]: how well the places of bones are known.
+    """
     channels = armature.channel_of(shape, stand)
     armature_object.data[DOFS_KEY] = {name: {"bone": c.bone, "path": c.path, "index": c.index} for name, c in channels.items()}
-    _add_uncertainty(armature_object, {name: channels[name].bone for name in dof_names}, frames, sigma)
+    sigmas = {name: (channels[name].bone, column) for name, column in zip(dof_names, sigma.T)}
+    _add_uncertainty(armature_object, sigmas | {name: (name, column) for name, column in (place_sigma or {}).items()}, frames)
     action = bpy.data.actions.new(NAME)
     armature_object.animation_data.action = action
     for column, name in enumerate(dof_names):
@@ -47,14 +54,28 @@ def add_action(
     return action
 
 
-def _add_uncertainty(armature_object: bpy.types.Object, bone_of: Mapping[str, str], frames: np.ndarray, sigma: np.ndarray) -> None:
-    """The sigmas (T, D) of the DOFs as an action in a locked NLA track. `bone_of`: the bone of each DOF, in their order."""
+def place_sigmas(shape: BodyShape, joints: JointTable, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """By bone of the armature the larger sigma (T,) [m] of the joints at its ends, without what is common to all frames, as in the report;
+    NaN in frames that the table lacks. Tables of earlier versions have only the whole sigmas."""
+    rows = {int(frame): row for row, frame in enumerate(joints.frames)}
+    at = np.array([rows.get(int(frame), len(rows)) for frame in frames], dtype=np.intp)
+    own = {name: np.where(np.isfinite(sigma), sigma, joints.sigma_m[name]) for name, sigma in joints.frame_sigma_m.items()}
+    found = {}
+    for bone in armature.rig_bones(shape):
+        ends = [own[joint] for joint in (bone.head_joint, bone.tail_joint) if joint in own]
+        if len(ends) == 2:
+            found[bone.name] = np.append(np.maximum(*ends), np.nan)[at]
+    return found
+
+
+def _add_uncertainty(armature_object: bpy.types.Object, sigmas: Mapping[str, tuple[str, np.ndarray]], frames: np.ndarray) -> None:
+    """Sigmas as an action in a locked NLA track: by name the bone and the values (T,)."""
     data, action = armature_object.animation_data_create(), bpy.data.actions.new(UNCERTAINTY)
     data.action = action
-    for column, (name, bone_name) in enumerate(bone_of.items()):
+    for name, (bone_name, sigma) in sigmas.items():
         pose_bone = armature_object.pose.bones[bone_name]
         pose_bone[f"sigma {name}"] = 0.0
-        key(action, armature_object, f'{pose_bone.path_from_id()}["sigma {name}"]', 0, frames, sigma[:, column], group=bone_name)
+        key(action, armature_object, f'{pose_bone.path_from_id()}["sigma {name}"]', 0, frames, sigma, group=bone_name)
     slot, data.action = data.action_slot, None
     if not len(frames):
         return

@@ -428,7 +428,8 @@ def _add_body(
         excluded.show(bpy.context.scene, metaballs.COLLECTION_KEY, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
-        action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma, stand)
+        places = action.place_sigmas(shape, contents.joints, motion.frames) if contents.joints is not None else None
+        action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma, stand, places)
         counts["frames of motion"] = len(motion.frames)
         if options.simplify_deg > 0:
             action.add_simplified(armature_object, shape, motion.frames, motion.dof_names, values, options.simplify_deg, stand)

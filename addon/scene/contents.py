@@ -21,7 +21,7 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.motion.formats.ply import Ply, read_ply
-from ...core.motion.tables import MotionTable, read_guessed, read_motion
+from ...core.motion.tables import JointTable, MotionTable, read_guessed, read_joints, read_motion
 from ...core.results.run_json import read_run
 from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
@@ -54,6 +54,7 @@ class Contents:
     raw: Mapping[str, np.ndarray] | None = None  # the trajectories before the filters, only on request
     shape: BodyShape | None = None
     motion: MotionTable | None = None  # radians, metres
+    joints: JointTable | None = None  # with their sigmas
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
     skins: FrameSkins | None = None  # only on request
     prepared: Prepared = field(default_factory=Prepared)
@@ -108,6 +109,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: 
         raw=_optional(out / "trajectories_raw.npz", "removed trajectories", _raw, warnings) if removed else None,
         shape=person,
         motion=motion,
+        joints=_joints(out / "joints.csv", warnings),
         skin_settings=settings,
         prepared=prepared,
         skins=_skins(person, motion, settings, monitor, warnings) if skins else None,
@@ -190,6 +192,14 @@ def _motion(path: Path, shape: BodyShape | None, warnings: list[str]) -> MotionT
         warnings.append(f"No action in the scene: {path.name} needs body.toml in the same folder.")
         return None
     return _optional(path, "action", lambda file: read_motion(file, shape.skeleton), warnings)
+
+
+def _joints(path: Path, warnings: list[str]) -> JointTable | None:
+    try:
+        return read_joints(path) if path.is_file() else None
+    except InputError as error:
+        warnings.append(f"No sigmas of joints in the scene: {error}")
+        return None
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ..body.shape import read_body
+from ..body.sigma_colours import SIGMAS_MM, sigma_colours
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
@@ -23,7 +24,7 @@ from ..results.folder import Results
 from ..take.footage import Footage
 from .close_up import Detail, alike, close_up
 from .drawing import plain, size_of, small_text, text_width
-from .overview import SIGMAS_MM, about_joints, sigma_colours
+from .overview import about_joints
 from .pictures import OPACITY, SKIN_COLOUR, colour
 
 WIDTH_PX, HEIGHT_PX = 1920, 1080  # of the movie, at most
@@ -106,7 +107,7 @@ def _panel(
     alpha = (OPACITY * covered)[..., None]
     drawn = ((1 - alpha) * picture + alpha * light[..., None] * SKIN_COLOUR).clip(0, 255).astype(np.uint8)
     at = {name: camera.project(xyz[None])[0] for name, (xyz, _) in joints.items()}
-    tint = {name: tuple(sigma_colours(np.array(1e3 * sigma)).tolist()) for name, (_, sigma) in joints.items()}
+    tint = {name: tuple(sigma_colours(np.array(1e3 * sigma))[::-1].tolist()) for name, (_, sigma) in joints.items()}
     spots = {name: tuple(np.rint(xy).astype(int).tolist()) for name, xy in at.items() if np.isfinite(xy).all() and np.abs(xy).max() < 3e4}
     for head, tail in bones:
         if head in spots and tail in spots:
@@ -136,7 +137,7 @@ def _add_legend(picture: np.ndarray, base: int, k: float) -> None:
     """The colours of the joints' sigmas, on a base line at the right."""
     ends = [f"{SIGMAS_MM[0]:g} mm", f"{SIGMAS_MM[-1]:g} mm"]
     right, gap, length = picture.shape[1] - 8, round(6 * k), round(LEGEND_PX * k)
-    colours = sigma_colours(np.geomspace(SIGMAS_MM[0], SIGMAS_MM[-1], length))
+    colours = sigma_colours(np.geomspace(SIGMAS_MM[0], SIGMAS_MM[-1], length))[:, ::-1]
     at = right - text_width(ends[1], k)
     small_text(picture, ends[1], (at, base), size=k)
     start = at - gap - length

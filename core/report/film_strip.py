@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .overview import COLOURS, SIGMAS_MM
+from ..body.sigma_colours import COLOURS, SIGMAS_MM
 
 MOST_FRAMES = 48  # in the film, besides the doubtful ones
 MOST_KEYS = 6  # in the strip, besides the doubtful ones
@@ -97,7 +97,7 @@ def _figure(shot: Shot) -> str:
 
 def legend() -> str:
     """The colours of the sigmas as a bar with its values."""
-    stops = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for b, g, r in COLOURS.tolist())
+    stops = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in COLOURS.tolist())
     values = "".join(f"<span>{value:g} mm{more}</span>" for value, more in zip(SIGMAS_MM.tolist(), (" or less", "", " or more")))
     return (
         f'<div class="legend"><div>Colour: how well the joints are known in this frame (one sigma)</div>'

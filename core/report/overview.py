@@ -7,6 +7,7 @@ import numpy as np
 
 from ..body.limb_words import FEW_FRAMES, MOST_SPANS, SIDES, frame_list, guessed_frames, limb_words
 from ..body.motion import BRIDGED, GUESSED, SEEN, SUSPECT, BodyFit
+from ..body.sigma_colours import sigma_colours
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
 from . import pictures
@@ -29,8 +30,6 @@ WHY = {  # the reasons of run.json's doubtful frames, in a sentence
     "fit suspect": "residuals are large or observations few",
     "fit partial": "some limbs have too few points",
 }
-SIGMAS_MM = np.array([1.0, 7.0, 50.0])  # of joints; their colours are
-COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
 FLESH_M = 0.12  # from a joint
 OPACITY = 0.6
 
@@ -93,12 +92,6 @@ def _of_surface(stages: Mapping[str, Any]) -> str:
     return f"{points} and {tracked['trajectories']:,} trajectories." if "trajectories" in tracked else f"{points}."
 
 
-def sigma_colours(sigma_mm: np.ndarray) -> np.ndarray:
-    """Colours (…, 3) BGR of sigmas (…) of joints."""
-    at = np.log(np.clip(np.nan_to_num(sigma_mm, nan=np.inf), SIGMAS_MM[0], SIGMAS_MM[-1]))
-    return np.stack([np.interp(at, np.log(SIGMAS_MM), COLOURS[:, c]) for c in range(3)], axis=-1)
-
-
 def bone_sigma_mm(body: BodyFit, index: int) -> np.ndarray:
     """The larger sigma (B,) of the two joints at a bone's ends, in one frame, without what is common to all frames."""
     names, sigma = body.motion.joint_names, 1e3 * body.motion.joint_frame_sigma_m[index]
@@ -112,7 +105,7 @@ def body_by_sigma(grey: np.ndarray, camera: Camera, skin: Mesh, sigma_mm: np.nda
     raster = rasterize(camera, skin.vertices_m, skin.triangles)
     normal = raster.interpolate(vertex_normals(skin.vertices_m, skin.triangles), skin.triangles) @ camera.R_cam_world.T
     light = 0.45 + 0.55 * np.clip(-normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12), 0, 1)
-    tint = raster.interpolate(sigma_colours(skin.weights @ sigma_mm), skin.triangles)
+    tint = raster.interpolate(sigma_colours(skin.weights @ sigma_mm)[:, ::-1], skin.triangles)
     flat = image.reshape(-1, 3)
     flat[raster.sample] = (1 - OPACITY) * flat[raster.sample] + OPACITY * light[:, None] * tint
     return image.clip(0, 255).astype(np.uint8)

@@ -159,6 +159,28 @@ def test_a_joint_that_is_pulled_is_clicked_in_every_view(blender: ModuleType, sc
         blender.ops.tricap.pull_joint(name="wrist.R", view="L", frame=99, x=50, y=60)
 
 
+def test_the_limb_of_a_dragged_joint_is_shown_in_every_view(blender: ModuleType, small_run: SmallRun) -> None:
+    from tricap.core.run.pulled_limb import FittedLimbs
+
+    pull, cameras = module("correcting.pull_joint"), {camera.name: camera for camera in small_run.rig.cameras}
+    frame, limbs = 3, FittedLimbs.read(small_run.out)
+    elbow, wrist = (small_run.joints_m[name][1] for name in ("elbow.R", "wrist.R"))
+    forearm_m = np.linalg.norm(wrist - elbow)
+    goal = elbow + forearm_m * np.array([0.6, 0.0, 0.8])
+    shown = pull.as_pulled(limbs.limb(frame, "wrist.R"), cameras, frame, goal)
+    assert shown.name == "wrist.R" and shown.frame == frame and set(shown.joint_px) == set(cameras)
+    for view, camera in cameras.items():
+        fitted, _ = shown.joint_px[view]
+        np.testing.assert_allclose(fitted, camera.project(wrist), atol=0.01)
+        assert shown.bones_px[view].shape[1:] == shown.outline_px[view].shape[1:] == (2, 2)
+        assert all(np.isfinite(lines[view]).all() for lines in (shown.bones_px, shown.outline_px))
+    draw, session = module("overlay.draw"), module("session").get_session()
+    draw.show_pulled(shown)
+    assert session.file.pulled is shown
+    draw.show_pulled(None)
+    assert session.file.pulled is None
+
+
 def test_the_floor_is_clicked_in_two_views(blender: ModuleType, scene: Any, small_run: SmallRun) -> None:
     place = np.array([-0.1, 0.3, -0.12])
     at = {camera.name: (camera.project(place) + 0.5).tolist() for camera in small_run.rig.cameras}

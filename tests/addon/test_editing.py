@@ -11,6 +11,7 @@ from tricap.core.body.shape import default_shape
 
 from .test_scene_standing import FLOOR_M, walk
 
+KNOWN_M, LOST_M = 2e-3, 0.08  # sigmas of places
 FRAMES, NOISY = 40, range(10, 20)
 
 
@@ -34,7 +35,9 @@ def walker(bpy: ModuleType, *, sliding_m: float = 0.0, bent: float = 0.5) -> Any
     values[:, arm] = np.linspace(0, 1, FRAMES)
     values[NOISY, arm] += np.random.default_rng(0).normal(0, 0.2, len(NOISY))
     sigma[NOISY, arm] = 0.2
-    action.add_action(body, shape, np.arange(FRAMES), names, values, sigma, Standing(lift_m=0.96, floor_m=FLOOR_M))
+    places = {bone.name: np.full(FRAMES, KNOWN_M) for bone in armature.rig_bones(shape) if not armature.is_finger(bone)}
+    places["forearm.R"][NOISY] = LOST_M
+    action.add_action(body, shape, np.arange(FRAMES), names, values, sigma, Standing(lift_m=0.96, floor_m=FLOOR_M), places)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, FRAMES - 1
     return body
 
@@ -129,16 +132,44 @@ def test_the_influence_is_blended_and_the_place_changes_where_it_is_zero() -> No
     assert influence[6] == influence[15] == influence[26] == 0.0
 
 
-def test_the_strip_shows_the_worst_of_the_chosen_bones(blender: ModuleType) -> None:
+def test_the_strips_show_how_well_trunk_and_limbs_are_known(blender: ModuleType) -> None:
     from tricap.addon.editing import uncertainty
 
-    sigmas = uncertainty.sigmas_of(walker(blender))
-    frames, worst = uncertainty.of_frames(sigmas, {"upper_arm.R"})
-    np.testing.assert_allclose(worst[NOISY.start], np.degrees(0.2), rtol=1e-5)
-    assert list(frames) == list(range(FRAMES)) and worst[0] == pytest.approx(0.5)
-    assert uncertainty.of_frames(sigmas, set())[1][NOISY.start] < np.degrees(0.2), "one uncertain bone does not make the body uncertain"
-    green, red = uncertainty.colour_of(np.array([0.5, 12.0]))
-    assert green[1] > green[0] and red[0] > red[1]
+    body = walker(blender)
+    sigmas = uncertainty.sigmas_of(body)
+    strips = uncertainty.strips(body, sigmas, set(), 5)
+    assert set(strips) == {"Trunk", "Arm right", "Arm left", "Leg right", "Leg left"}
+    worst = {name: uncertainty.of_frames(sigmas, bones)[1] for name, bones in strips.items()}
+    np.testing.assert_allclose(worst.pop("Arm right")[[0, NOISY.start]], [1e3 * KNOWN_M, 1e3 * LOST_M], rtol=1e-5)
+    assert all(np.allclose(sigma, 1e3 * KNOWN_M) for sigma in worst.values()), "a lost arm is the arm's alone"
+    assert uncertainty.strips(body, sigmas, {"forearm.R", "root"}, 1) == {"Selected bones": ["forearm.R"]}
+    ((name, every),) = uncertainty.strips(body, sigmas, set(), 4).items()
+    assert name == "Least known" and set(every) == set(sigmas), "in a low timeline there is room for one strip only"
+    frames, sigma = uncertainty.of_frames(sigmas, {"forearm.R"})
+    assert list(frames) == list(range(FRAMES)) and sigma[NOISY.start] == pytest.approx(1e3 * LOST_M)
+    blue, red = uncertainty.colour_of(np.array([0.5, 80.0]))[:, :3]
+    assert blue.argmax() == 2 and red.argmax() == 0
+    assert len(uncertainty.of_frames({}, set())[0]) == 0 and uncertainty.strips(body, {}, set(), 5) == {}
+
+
+def test_sigmas_of_bones_are_those_of_their_joints(blender: ModuleType) -> None:
+    from tricap.addon.scene import action
+    from tricap.core.motion.tables import JointTable
+
+    shape = default_shape(read_model("arm.R"))
+    own = {"shoulder.R": np.array([1e-3, 2e-3]), "elbow.R": np.array([4e-3, 1e-3]), "wrist.R": np.array([np.nan, np.nan])}
+    whole = {name: np.array([9e-3, 9e-3]) for name in own}
+    table = JointTable(
+        frames=np.array([3, 4]),
+        time_s=np.zeros(2),
+        joints_m={name: np.zeros((2, 3)) for name in own},
+        sigma_m=whole,
+        frame_sigma_m=own,
+        known={name: ("seen", "seen") for name in own},
+    )
+    found = action.place_sigmas(shape, table, np.array([4, 3, 8]))
+    np.testing.assert_allclose(found["upper_arm.R"], [2e-3, 4e-3, np.nan])
+    np.testing.assert_allclose(found["forearm.R"], [9e-3, 9e-3, np.nan], err_msg="a table of an earlier version has the whole sigma only")
 
 
 def test_what_cannot_be_edited(blender: ModuleType) -> None:

@@ -163,7 +163,8 @@ def walker(bpy: ModuleType, *, fingers: bool = False) -> Any:
     shape = shape_for_skin(shape, SkinSettings()) if fingers else shape
     stand = Standing(lift_m=0.96, floor_m=FLOOR_M)
     body, values = armature.add_armature(scene.collection, shape, stand), walk(shape, 0.96)
-    action.add_action(body, shape, np.arange(FRAMES), shape.skeleton.dof_names, values, np.full(values.shape, 0.01), stand)
+    known = {bone.name: np.full(FRAMES, 0.003) for bone in armature.rig_bones(shape) if not armature.is_finger(bone)}
+    action.add_action(body, shape, np.arange(FRAMES), shape.skeleton.dof_names, values, np.full(values.shape, 0.01), stand, known)
     scene.frame_start, scene.frame_end = 0, FRAMES - 1
     return body
 

@@ -49,11 +49,33 @@ def wrist_px() -> np.ndarray:
     return np.asarray(pull.cameras_of(bpy.context.scene)["C"].project(places["wrist.R"]))
 
 
+def taken_back(area: bpy.types.Area, before: np.ndarray, goal: np.ndarray) -> drive.Steps:
+    """While the joint is dragged, the limb is shown where it would be; Esc takes it back, and the next joint can be dragged."""
+    dragging = drive.drag(display.image_place(area, *before), display.image_place(area, *(before + 3 * (goal - before))))
+    shown = lambda: module("addon.session").get_session().file.pulled  # noqa: E731
+    while shown() is None:
+        next(dragging)
+        yield
+    for _ in range(10):  # to the end, with the button still pressed
+        next(dragging)
+        yield
+    pulled = shown()
+    drive.check(len(pulled.outline_px["C"]) > 20 and len(pulled.bones_px["C"]), "the limb is drawn")
+    drive.check(np.linalg.norm(pulled.joint_px["C"][1] - before) > 2 * PULLED_PX, "where it is dragged to")
+    yield from drive.shot("2_dragging")
+    yield from drive.key("ESC")
+    drive.check(shown() is None, "Esc takes it back")
+    for _ in dragging:  # the button is released
+        yield
+    drive.check("keyframes" not in module("addon.project").table(bpy.context.scene), "and makes no keyframe")
+
+
 def pulled() -> drive.Steps:
     """Drag the wrist; it is a keyframe; fit again: the wrist follows."""
     area, before, scene = drive.area_of("CLIP_EDITOR"), wrist_px(), bpy.context.scene
     goal = before + (0.0, PULLED_PX)
     yield from drive.press(area, "tricap.pull_joint")
+    yield from taken_back(area, before, goal)
     yield from drive.drag(display.image_place(area, *before), display.image_place(area, *goal))
     yield from drive.key("ESC")
     said = module("addon.project").table(scene)

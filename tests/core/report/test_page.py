@@ -19,6 +19,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.motion import BRIDGED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from tricap.core.body.shape import default_shape
+from tricap.core.body.sigma_colours import sigma_colours
 from tricap.core.body.skin.contour_skin import SkinSettings
 from tricap.core.foundation import store
 from tricap.core.report import overview
@@ -30,7 +31,7 @@ from tricap.core.report.figures import figures_csv
 from tricap.core.report.film_strip import MOST_FRAMES, Shot, chosen_frames
 from tricap.core.report.graphs import SCRIPT, curve_graph
 from tricap.core.report.limb_strip import limb_strip
-from tricap.core.report.overview import NOT_WANTED, WHY, body_by_sigma, bone_sigma_mm, headline, joint_words, sigma_colours, verdict
+from tricap.core.report.overview import NOT_WANTED, WHY, body_by_sigma, bone_sigma_mm, headline, joint_words, verdict
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.person import skin_in
 from tricap.core.report.pictures import jpeg
@@ -115,7 +116,7 @@ def test_every_reason_has_a_sentence() -> None:
 def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
     """From blue to red; not finite is red. In the picture the forearm, whose wrist is uncertain, is redder than the upper arm."""
     blue, yellow, red, unknown = sigma_colours(np.array([0.1, 7.0, 500.0, np.nan])).tolist()
-    assert blue[0] > blue[2] and yellow[1] > 200 and red[2] > 200 and unknown == red
+    assert blue[2] > blue[0] and yellow[1] > 200 and red[0] > 200 and unknown == red
     body, camera = fitted(), scenes.three_cameras()["C"]
     assert bone_sigma_mm(body, 0).tolist() == [2.0, 60.0]
     skin_at = skin_in(Path("nowhere"), body, SkinSettings())
