@@ -72,10 +72,7 @@ def within(near: "sparse.csr_matrix", chosen: np.ndarray, rings: int) -> np.ndar
 def seam_jumps(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.ndarray:
     """The jumps (F, 4) at the edges of the quads [rad], 0 at those that are no border of two parts. `part` (V,)."""
     beyond, edge = beyond_edges(faces)
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    middle = corner.mean(axis=1)
+    normal, middle = face_normals(vertices, faces), vertices[faces].mean(axis=1)
     turn = np.arccos(np.clip(np.einsum("fk,fik->fi", normal, normal[beyond]), -1.0, 1.0))
     turn *= np.sign(np.einsum("fk,fik->fi", normal, middle[beyond] - middle[:, None]))  # valleys positive
     nearby = (np.roll(turn, -2, axis=1) + turn[beyond, (edge + 2) % 4]) / 2
@@ -83,11 +80,16 @@ def seam_jumps(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.
     return np.asarray(np.where(own[:, None] != own[beyond], np.abs(turn - nearby), 0.0))
 
 
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Outward unit normals (F, 3) of quads."""
+    a, b, c, d = (vertices[faces[:, i]] for i in range(4))
+    normal = cross(c - a, d - b)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+
+
 def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The faces (F,) that are steep to the mean of the faces around one of their corners."""
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = face_normals(vertices, faces)
     mean = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 4), len(vertices)) for k in range(3)], axis=1)
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     return np.asarray((np.einsum("fk,fck->fc", normal, mean[faces]) < FOLD).any(axis=1))
@@ -95,12 +97,17 @@ def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def flipped(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The quads (F,) that, at one of their corners, face away from the surface around it: flipped ones, and those folded in themselves."""
-    corner = vertices[faces]
-    normal = cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
-    mean = np.stack([np.bincount(faces.ravel(), normal[..., k].ravel(), len(vertices)) for k in range(3)], axis=1)[faces]
-    whole = normal.sum(axis=1, keepdims=True)
-    return np.asarray((((normal * mean).sum(axis=2) <= 0) | ((whole * mean).sum(axis=2) <= 0)).any(axis=1))
+    corners = [vertices[faces[:, i]] for i in range(4)]
+    edges = [after - corner for corner, after in zip(corners, corners[1:] + corners[:1])]
+    normals = [cross(before, edge) for before, edge in zip(edges[-1:] + edges[:-1], edges)]
+    normals = [n / np.maximum(np.sqrt(np.einsum("fk,fk->f", n, n)), 1e-12)[:, None] for n in normals]
+    stacked, whole = np.concatenate(normals), sum(normals)
+    mean = np.stack([np.bincount(faces.T.ravel(), stacked[:, k], len(vertices)) for k in range(3)], axis=1)
+    away = [
+        (np.einsum("fk,fk->f", own, mean[faces[:, i]]) <= 0) | (np.einsum("fk,fk->f", whole, mean[faces[:, i]]) <= 0)
+        for i, own in enumerate(normals)
+    ]
+    return np.asarray(np.any(away, axis=0))
 
 
 def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.ndarray) -> np.ndarray:

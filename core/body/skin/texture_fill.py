@@ -43,10 +43,13 @@ class Texels:
     shares: np.ndarray  # (N, 3) and their weights
     ahead: np.ndarray  # (3,) where the body looks
 
-    def at(self, values: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+    def at(self, values: np.ndarray, rows: "slice | np.ndarray" = slice(None)) -> np.ndarray:
         """Values (V, …) of the vertices at the texels (N, …), or at some of them."""
-        corners, shares = self.corners[rows], self.shares[rows]
-        return np.asarray(sum(shares[:, i].reshape(-1, *[1] * (values.ndim - 1)) * values[corners[:, i]] for i in range(3)))
+        corners, shares = self.corners[rows].T, self.shares[rows].T.reshape(3, -1, *[1] * (values.ndim - 1))
+        first, *others = (share * values.take(corner, axis=0) for corner, share in zip(corners, shares))
+        for other in others:
+            first += other
+        return np.asarray(first)
 
     @property
     def vertex(self) -> np.ndarray:
@@ -55,7 +58,7 @@ class Texels:
 
 
 def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The colours (N, C) of all texels, from those that were `seen` (N,). 5 s for a whole body and 700,000 texels."""
+    """The colours (N, C) of all texels, from those that were `seen` (N,). 2 s for a whole body and 700,000 texels."""
     if not seen.any():
         return np.full(colour.shape, PLAIN)
     skin = texels.skin
@@ -74,11 +77,11 @@ def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
         wanted, common = np.flatnonzero(~known), of_vertices[known[of_vertices]]
         source, check = sources(rows, wanted), sources(rows, common)
         wanted, source, common, check = wanted[source >= 0], source[source >= 0], common[check >= 0], check[check >= 0]
-        h = _continued(texels, common, found[common] - found[check], np.zeros(colour.shape[1]), FADING_M)  # (3)
-        found[wanted] = np.clip(found[source] + h[wanted], low, high)
+        h = _continued(texels, wanted, common, found[common] - found[check], np.zeros(colour.shape[1]), FADING_M)  # (3)
+        found[wanted] = np.clip(found[source] + h, low, high)
         known[wanted] = True
-    rows = np.flatnonzero(known)
-    found[~known] = _continued(texels, rows, found[rows], found[rows].mean(axis=0))[~known]
+    rows, missing = np.flatnonzero(known), np.flatnonzero(~known)
+    found[missing] = _continued(texels, missing, rows, found[rows], found[rows].mean(axis=0))
     return found
 
 
@@ -114,11 +117,14 @@ def _nearest(points: np.ndarray, to: np.ndarray) -> np.ndarray:
     """The rows (M,) of the nearest of points (N, K) `to` others (M, K), any row where none is near enough."""
     from scipy.spatial import cKDTree
 
-    return np.minimum(cKDTree(points).query(to, distance_upper_bound=FARTHEST_M, workers=THREADS)[1], len(points) - 1)
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # on a surface, a quarter of the time of a balanced one
+    return np.minimum(tree.query(to, distance_upper_bound=FARTHEST_M, workers=THREADS)[1], len(points) - 1)
 
 
-def _continued(texels: Texels, rows: np.ndarray, values: np.ndarray, far: np.ndarray, fading_m: float = np.inf) -> np.ndarray:
-    """Values (N, C) at all texels that continue those (M, C) of the texels `rows` smoothly and pass to `far` (C,)."""
+def _continued(
+    texels: Texels, wanted: np.ndarray, rows: np.ndarray, values: np.ndarray, far: np.ndarray, fading_m: float = np.inf
+) -> np.ndarray:
+    """Values (K, C) at the texels `wanted` that continue those (M, C) of the texels `rows` smoothly and pass to `far` (C,)."""
     from scipy import sparse
 
     skin, count = texels.skin, len(texels.skin.vertices_m)
@@ -128,4 +134,4 @@ def _continued(texels: Texels, rows: np.ndarray, values: np.ndarray, far: np.nda
     C, area = laplacian(skin.vertices_m, skin.faces)
     tie, loose = STIFF * (times > 0), WEAK + area / fading_m**2
     right = tie[:, None] * total / np.maximum(times, 1)[:, None] + loose[:, None] * far
-    return texels.at(factorised(sparse.diags(tie + loose) - C).solve(right))
+    return texels.at(factorised(sparse.diags(tie + loose) - C).solve(right), wanted)

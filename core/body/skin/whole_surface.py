@@ -19,7 +19,7 @@ import numpy as np
 from ...foundation.arrays import frozen
 from ...foundation.progress import Monitor
 from ..fields import EXPONENTIAL, Potential
-from ..metaballs import THRESHOLD, active_balls, local_points, squared_distances
+from ..metaballs import THRESHOLD, active_balls
 from ..parts import body_parts
 from ..shape import BodyShape
 from ..skeleton import bone_frames
@@ -42,6 +42,9 @@ class WholeSurface:
         self._shape, self._parts = shape, body_parts(shape)
         self._R, self._head = bone_frames(shape.skeleton, shape.lengths_m, np.asarray(motion, dtype=np.float64))
         balls, neighbours = shape.metaballs, shape.skeleton.neighbours
+        axes, head = self._R[balls.bone_index] / balls.radii_m[:, None, :], self._head[balls.bone_index]
+        shift = np.einsum("mi,mij->mj", head, axes) + balls.centres_m(shape.lengths_m) / balls.radii_m
+        self._axes, self._shift = axes.transpose(1, 0, 2).reshape(3, -1), shift.ravel()  # (3, 3 m), (3 m): q = Xᵀ axes − shift
         self._own = np.stack([np.isin(balls.bone_index, part.bones) for part in self._parts], axis=1).astype(np.float64)
         self._of_bone = {b: active_balls(balls, neighbours, b).astype(np.float64) for part in self._parts for b in part.bones}
 
@@ -88,8 +91,10 @@ class WholeSurface:
         return np.asarray(-gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12))
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        q, d = squared_distances(self._shape.metaballs, self._shape.lengths_m, local_points(self._R, self._head, points))
-        return q, self._shape.metaballs.weight * np.exp(-2 * d)
+        """q (N, 3 m), the coordinates of points in the balls' axes over their radii, ball after ball, and the balls' fields (N, m)."""
+        q = points @ self._axes - self._shift
+        each = q.reshape(len(points), -1, 3)
+        return q, self._shape.metaballs.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", each, each))
 
     def _joined(self, points: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """G (N,) and ∇G (N, 3), without the gradients of the weights u.  (1)"""
@@ -99,8 +104,7 @@ class WholeSurface:
             rows = np.flatnonzero(part == p)
             G[rows], factors = self._field_of_part(int(p), points[rows], terms[rows])
             of_ball[rows] = terms[rows] * factors
-        balls = self._shape.metaballs
-        return G, -4 * np.einsum("nm,nmi,mji->nj", of_ball, q / balls.radii_m, self._R[balls.bone_index], optimize=True)
+        return G, -4 * (np.repeat(of_ball, 3, axis=1) * q) @ self._axes.T
 
     def _field_of_part(self, p: int, points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """G (N,) at points of part p, and the balls' factors in it and in its gradient (N, m).  (1)"""

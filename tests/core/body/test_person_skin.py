@@ -18,7 +18,7 @@ from tricap.core.body.skin.mesh import DETAIL, SkinSettings, corner_uv
 from tricap.core.body.skin.person_skin import REST, cage, read_skin, resampled, rest_skin, with_relief, write_skin
 from tricap.core.body.skin.posed import Poser
 from tricap.core.body.skin.relief import PRIOR_M, SurfacePoints
-from tricap.core.body.skin.surface_operators import factorised, laplacian, vertex_normals
+from tricap.core.body.skin.surface_operators import LEAST_COTANGENT, factorised, laplacian, vertex_normals
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -64,6 +64,22 @@ def test_the_operators_of_a_sphere() -> None:
     assert area.sum() == pytest.approx(4 * np.pi * 0.01, rel=0.005)
     curvature = np.einsum("nk,nk->n", normals, C @ vertices) / area
     assert (curvature * area).sum() / area.sum() == pytest.approx(-20, rel=0.1) and curvature.max() < -19  # −2/r on the whole
+
+
+def test_laplacian_is_the_sum_over_both_triangulations() -> None:
+    vertices, faces = sphere(0.1, 3)
+    vertices = vertices + np.random.default_rng(0).normal(scale=0.004, size=vertices.shape)
+    wanted, area = np.zeros((len(vertices), len(vertices))), np.zeros(len(vertices))
+    for triangle in np.concatenate([faces[:, c] for c in ([0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 0])]):
+        for a, b, c in (np.roll(triangle, i) for i in range(3)):
+            u, v = vertices[b] - vertices[a], vertices[c] - vertices[a]
+            across = np.linalg.norm(np.cross(u, v))
+            weight = max(u @ v / across, LEAST_COTANGENT) / 4
+            wanted[[b, c], [c, b]] += weight
+            wanted[[b, c], [b, c]] -= weight
+            area[a] += across / 12
+    C, found = laplacian(vertices, faces)
+    assert np.abs(C.toarray() - wanted).max() < 1e-12 and np.allclose(found, area, rtol=1e-12)
 
 
 def test_equations_of_a_mesh_are_solved() -> None:

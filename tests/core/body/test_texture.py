@@ -12,7 +12,20 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import rest_skin
 from tricap.core.body.skin.posed import Poser
-from tricap.core.body.skin.texture import EDGE_PX, MASK, RIM_PX, TEXTURE, Texture, TextureBaker, View, nearest_depth, write_texture
+from tricap.core.body.skin.surface_operators import vertex_normals
+from tricap.core.body.skin.texture import (
+    EDGE_PX,
+    MASK,
+    RIM_PX,
+    TEXTURE,
+    Texture,
+    TextureBaker,
+    View,
+    _facing,
+    _pictured,
+    nearest_depth,
+    write_texture,
+)
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import rasterize
 from tricap.core.synthetic.arm import arm_rig
@@ -49,6 +62,17 @@ def filmed(camera: Camera, motion: np.ndarray, gain: float) -> View:
     image = np.full((camera.size_px[1], camera.size_px[0], 3), 30.0)
     image.reshape(-1, 3)[raster.sample] = gain * raster.interpolate(PAINT, TRIANGLES)
     return View(camera=camera, rgb=image.astype(np.float32))
+
+
+def test_pixels_between_vertices_are_linear() -> None:
+    camera, motion = arm_rig(384).cameras[0], poses()[1]
+    posed = Poser(SHAPE, SKIN.weights).posed(SKIN.vertices_m, motion)
+    middle = posed[TRIANGLES].mean(axis=1)
+    found = _pictured(camera, posed, vertex_normals(posed, SKIN.faces))[TRIANGLES].mean(axis=1)
+    behind = camera.centre_m - camera.R_cam_world[2:]
+    assert np.abs(found[:, :2] - camera.project(middle)).max() < 0.01  # 0.007 here, 0.006 on a walker
+    assert np.abs(found[:, 2] - camera.to_camera(middle)[:, 2]).max() < 1e-6
+    assert not _facing(_pictured(camera, behind, camera.R_cam_world[2:])).any()
 
 
 @pytest.fixture(scope="module")
