@@ -158,28 +158,34 @@ def observed(problem: Problem, at: Estimate) -> Observed:
         frames.append(problem.observe(t, state))
     for t, (a, b) in enumerate(zip(states, states[1:])):
         problem.monitor.check()
-        steps.append(problem.observe_step(t, a, b) if problem.observe_step is not None else None)
+        steps.append(_step(problem, t, a, b))
     return Observed(frames=frames, steps=steps)
+
+
+def _step(problem: Problem, t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+    return problem.observe_step(t, a, b) if problem.observe_step is not None else None
 
 
 def linearise(problem: Problem, at: Estimate, factors: Scales | None = None, given: Observed | None = None) -> Linearised:
     """Weights, cost and normal equations at a motion and shape vector, of the observations there, which may be `given`.
+
+    Those that are not given are made frame by frame: what was evaluated for them is released before the next frame is observed.
 
     `factors`: variance factors of the kinds of observations (`variance_factors`), for covariances only.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    factors, layout, given = factors or Scales(), problem.parameters.layout, given or observed(problem, at)
+    factors, layout = factors or Scales(), problem.parameters.layout
     T, D = at.motion.shape
     lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
     states = problem.parameters.states(at.motion, at.vector)
     for t, state in enumerate(states):
         problem.monitor.check()
-        _add_frame(problem, lin, t, state, given.frames[t], at.scales, factors)
-    for t, step in enumerate(given.steps):
+        _add_frame(problem, lin, t, state, given.frames[t] if given else problem.observe(t, state), at.scales, factors)
+    for t, (a, b) in enumerate(zip(states, states[1:])):
         problem.monitor.check()
-        _add_step(problem, lin, t, states[t], states[t + 1], step, at.scales.steps, factors.steps)
+        _add_step(problem, lin, t, a, b, given.steps[t] if given else _step(problem, t, a, b), at.scales.steps, factors.steps)
     for o in problem.shape_observations if len(problem.free_shape) else ():
         r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, layout.shape_columns(problem.free_shape)], problem.shape_weight
         lin.equations.corner += w * J.T @ J
