@@ -111,9 +111,10 @@ class ProfileTable:
         place = np.clip((along - self.first[bone]) / self.step[bone], 0.0, ALONG - 1)
         before = np.minimum(place.astype(np.intp), ALONG - 2)
         share = (place - before)[:, None]
-        side = np.where(across_m >= 0, [0, 1], [2, 3])
-        at, bone = before[:, None], bone[:, None]
-        return np.asarray((1 - share) * self.radii_m[bone, at, side] + share * self.radii_m[bone, at + 1, side])
+        towards = len(SIDES) * (ALONG * bone + before)[:, None] + [0, 1] + 2 * (across_m < 0)
+        radii = self.radii_m.reshape(-1)
+        first = radii.take(towards)
+        return np.asarray(first + share * (radii.take(towards + len(SIDES)) - first))
 
 
 def chain_neighbours(shape: BodyShape) -> np.ndarray:

@@ -220,15 +220,16 @@ class FitContext:
         """What is seen in frame index `t`, for a search."""
         return Evidence.of(points, self.background.cells(t), self.settings.voxel_m)
 
-    def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
-        """The `support` and the area of the person's cells that the body explains, less that of limbs in the background and half the
-        squared residuals of joints in frame index t and of the DOFs' limits (capped)."""
+    def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, support: float | None = None) -> float:
+        """The `support` (computed unless it is given) and the area of the person's cells that the body explains, less that of limbs in the
+        background and half the squared residuals of joints in frame index t and of the DOFs' limits (capped)."""
         state = self.parameters.state(motion, vector)
         limits = [prior for prior in self.priors if isinstance(prior, JointLimits)]
         residuals = np.concatenate([o.residual(state) for o in (*self.joints(t), *limits)])
         seen = self.seen(t, points)
         area = explained_area(seen, state, free_bones(self.parameters), EXPLAINED_WIDTH_M) if seen.cells else 0.0
-        return self.support(t, points, motion, vector) + area - 0.5 * float(np.minimum(residuals**2, LARGEST_RESIDUAL**2).sum())
+        support = self.support(t, points, motion, vector) if support is None else support
+        return support + area - 0.5 * float(np.minimum(residuals**2, LARGEST_RESIDUAL**2).sum())
 
 
 def _hard(

@@ -20,7 +20,7 @@ from ..body.skeleton import bone_frames, frames_of_bones
 from ..geometry.camera import Camera
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
-from .inputs.silhouettes import nearest_to_segment
+from .inputs.silhouettes import near_rays
 from .limb import Limb
 from .segmentation import facing_bone, gap_to_bone, near_pairs
 from .state import BodyState, ShapeParameters, free_bones
@@ -31,7 +31,7 @@ CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of
 UNSEEN = 0.2  # of a limb's area: rims of the rest of the body are no larger
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
 BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
-LARGEST = 256  # poses evaluated at once; several threads gain nothing here
+LARGEST = 40_000  # distances from one bone in all poses that are evaluated at once; several threads gain nothing here
 FAR = 4.0  # widths, from where on nothing is explained
 EXPLAINED = 0.95  # of a point or cell: no limb is looked for there
 FACING = 0.3  # least cosine between a point's normal and the limb's
@@ -39,6 +39,7 @@ PLACES = np.array([0.15, 0.4, 0.65, 0.9])  # along a bone, where it must not lie
 CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other part
 BEHIND_M = 0.06  # a limb so far before measured points would hide them
 CELL_OF_DEPTH_M = 0.03
+_ZERO, _ONE = np.float32(0), np.float32(1)  # numpy is slower with numbers of another type
 LARGEST_PX = 1e6  # of an end of a bone in an image: in the plane of a camera a projection has no limit
 
 
@@ -139,16 +140,22 @@ class Evidence:
         return CELL_WEIGHT / len(self.cells) * (size / self.voxel_m) ** 2
 
 
-def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
-    """(3) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
+def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.ndarray, width_m: float, least: float = -np.inf) -> np.ndarray:
+    """(3) of a limb in N poses (N, D), of a body with the shape vector (S,); for poses whose gain is not above `least`, perhaps only an
+    upper bound that is not above it, either."""
     state = limb.parameters.state(poses[0], vector)
     others = _others(limb, state)
 
     def gains(rows: slice) -> np.ndarray:
         capsules = _limb_capsules(limb, poses[rows], state)
-        return _explained_by(evidence, capsules, state, width_m, UNSEEN) - _misplaced(evidence, capsules, state, others)
+        gain = _explained_by(evidence, capsules, state, width_m, UNSEEN, least)
+        reached = np.flatnonzero(gain > least)
+        if len(reached):
+            gain[reached] -= _misplaced(evidence, capsules.take(reached), state, others)
+        return gain
 
-    return np.concatenate([gains(slice(i, i + LARGEST)) for i in range(0, max(len(poses), 1), LARGEST)])
+    together = 1 + LARGEST // max(len(evidence.taken), *(len(share) for share in evidence.taken_cells), 1)
+    return np.concatenate([gains(slice(i, i + together)) for i in range(0, max(len(poses), 1), together)])
 
 
 def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
@@ -194,9 +201,13 @@ class _Capsules:
             first_m=head,
             axis=R[..., 1],
             length_m=state.lengths_m[bones],
-            radii_m=np.array([[state.profiles[b].radii_m[i].mean() for i in (0, -1)] for b in bones.tolist()]),
+            radii_m=np.array([[state.profiles[b].radii_m[i].mean() for i in (0, -1)] for b in bones.tolist()], np.float32),
             posed=posed[bones],
         )
+
+    def take(self, poses: np.ndarray) -> "_Capsules":
+        """Those in some of the poses."""
+        return replace(self, first_m=self.first_m[poses], axis=self.axis[poses])
 
     def image(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Both ends (N, 2, K, 2) [px] in a view, and the metres of a pixel (N, K) float32 at the middles."""
@@ -221,14 +232,23 @@ def _others(limb: Limb, state: BodyState) -> np.ndarray:
     return np.array([b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer], dtype=np.intp)
 
 
-def _explained_by(evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float, unseen: float = 0.0) -> np.ndarray:
-    """The first terms of (3) in N poses (N,), with a share `unseen`; a cell's area is that at the first capsule in one `state`."""
-    cells = np.zeros(len(capsules.first_m))
-    for view, share in zip(evidence.cells, evidence.taken_cells):
-        cells += evidence.cell_area(view, state.head_m[capsules.bones[0]]) * _gain_of_cells(view, capsules, share, width_m)
+def _explained_by(
+    evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float, unseen: float = 0.0, least: float = -np.inf
+) -> np.ndarray:
+    """The first terms of (3) in N poses (N,), with a share `unseen`; a cell's area is that at the first capsule in one `state`. An upper
+    bound for poses that do not get above `least`."""
+    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
     own = 2 * float((capsules.radii_m.mean(axis=1) * capsules.length_m).sum()) / evidence.voxel_m**2
-    points = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
-    return np.asarray(points + np.maximum(cells - unseen * CELL_WEIGHT * own, 0.0))
+    rims = unseen * CELL_WEIGHT * own
+    areas = [evidence.cell_area(view, state.head_m[capsules.bones[0]]) for view in evidence.cells]
+    most = max(sum(area * float((1 - share).sum()) for area, share in zip(areas, evidence.taken_cells)) - rims, 0.0)
+    above = gain + most > least
+    gain[~above] += most
+    some, cells = capsules.take(above), np.zeros(int(above.sum()))
+    for view, share, area in zip(evidence.cells, evidence.taken_cells, areas):
+        cells += area * _gain_of_cells(view, some, share, width_m)
+    gain[above] += np.maximum(cells - rims, 0.0)
+    return gain
 
 
 def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:
@@ -240,9 +260,8 @@ def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, 
 
 def _cells_explained(view: PersonCells, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:
     """The share (M,) of each of a view's cells that some bones of a body explain."""
-    rows, bone = np.repeat(np.arange(len(view.xy_px)), len(bones)), np.tile(bones, len(view.xy_px))
-    origin = np.broadcast_to(view.camera.centre_m, (len(rows), 3))
-    X = nearest_to_segment(origin, view.directions[rows], state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone])
+    origin = np.broadcast_to(view.camera.centre_m, view.directions.shape)
+    rows, bone, X = near_rays(origin, view.directions, state, FAR * width_m, bones)
     return _largest(rows, _weight(np.maximum(gap_to_bone(X, state, bone), 0.0), width_m), len(view.xy_px))
 
 
@@ -259,43 +278,68 @@ def _weight(gap: np.ndarray, width_m: float) -> np.ndarray:
 
 
 def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    best, unknown = np.zeros((len(capsules.first_m), len(points.xyz_m)), np.float32), ~points.normals.any(axis=1)
+    """(2) of points in N poses (N,), in single precision: products of matrices give what is linear in 1, X and X² of all pairs."""
     origin = capsules.first_m[0, 0]  # numbers are small from here
     X, normals = (v.astype(np.float32) for v in (points.xyz_m - origin, points.normals))
-    for k in range(len(capsules.length_m)):
+    along_normal = np.where(normals.any(axis=1), np.einsum("pi,pi->p", X, normals), np.inf)  # an unknown normal points outwards
+    places = np.column_stack([X, np.ones(len(X)), np.einsum("pi,pi->p", X, X), normals, along_normal]).astype(np.float32).T
+    gap = np.full((len(capsules.first_m), len(X)), np.inf, np.float32)
+    for k, length in enumerate(capsules.length_m.astype(np.float32)):
         first, axis = (v.astype(np.float32) for v in (capsules.first_m[:, k] - origin, capsules.axis[:, k]))
-        along, distance = _from_axis(X, first, axis, np.full(len(first), capsules.length_m[k], np.float32))
-        outwards = np.einsum("pi,pi->p", X, normals) - first @ normals.T - along * (axis @ normals.T)
-        facing = (outwards > FACING * distance) | unknown
-        np.maximum(best, facing * _weight(distance - capsules.radius(k, along / capsules.length_m[k]), width_m), out=best)
-    return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
+        squares = np.einsum("nd,nd->n", first, first)[:, None]
+        along = np.hstack([axis, -np.einsum("nd,nd->n", axis, first)[:, None]]) / length @ places[:4]
+        distance = np.hstack([-2 * first, squares, np.ones_like(squares)]) @ places[:5]  # squared, from the capsule's first end
+        nearest = np.clip(along, _ZERO, _ONE)
+        along += along
+        along -= nearest
+        along *= nearest
+        along *= length * length
+        distance -= along
+        np.sqrt(np.maximum(distance, _ZERO, out=distance), out=distance)
+        outwards = np.hstack([-first, np.ones_like(squares)]) @ places[5:]
+        outwards -= nearest * (length * axis @ places[5:8])
+        facing = outwards > np.float32(FACING) * distance
+        distance -= capsules.radius(k, nearest)
+        np.minimum(gap, np.abs(distance, out=distance), out=gap, where=facing)
+    return _gain(gap, taken, width_m)
 
 
 def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    best = np.zeros((len(capsules.first_m), len(view.xy_px)), np.float32)
-    if not len(view.xy_px):
-        return best.sum(axis=1)
+    """(2) of cells in N poses (N,): places along and across the image of a capsule, the first as fractions, the others in metres."""
+    gap = np.full((len(capsules.first_m), len(view.xy_px)), np.inf, np.float32)
+    if not gap.size:
+        return gap.sum(axis=1)
     centre = view.xy_px.mean(axis=0)
     ends_px, metres = capsules.image(view.camera)
     visible = (np.abs(ends_px) < LARGEST_PX).all(axis=(1, 3))
-    a, ab = (np.where(visible[..., None], v, 1.0).astype(np.float32) for v in (ends_px[:, 0] - centre, ends_px[:, 1] - ends_px[:, 0]))
-    size = np.maximum(np.linalg.norm(ab, axis=-1), 1e-6)
-    xy = (view.xy_px - centre).astype(np.float32)
+    a, ab = (np.where(visible[..., None], v, 1.0) for v in (ends_px[:, 0] - centre, ends_px[:, 1] - ends_px[:, 0]))
+    size = np.maximum(np.linalg.norm(ab, axis=-1), 1e-6)[..., None]
+    normal = np.stack([-ab[..., 1], ab[..., 0]], axis=-1) * metres[..., None] / size
+    along, across = (
+        np.concatenate([v, -np.einsum("nkd,nkd->nk", v, a)[..., None]], axis=-1).astype(np.float32) for v in (ab / size**2, normal)
+    )
+    across[~visible] = 0.0, 0.0, np.inf
+    length = (size * metres[..., None]).astype(np.float32)
+    xy = np.column_stack([view.xy_px - centre, np.ones(len(view.xy_px))]).astype(np.float32).T
     for k in range(len(capsules.length_m)):
-        along, distance = _from_axis(xy, a[:, k], ab[:, k] / size[:, k, None], size[:, k])
-        gap = distance * metres[:, k, None] - capsules.radius(k, along / size[:, k, None])
-        np.maximum(best, visible[:, k, None] * _weight(np.maximum(gap, 0.0), width_m), out=best)
-    return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
+        beyond, distance = along[:, k] @ xy, across[:, k] @ xy
+        nearest = np.clip(beyond, _ZERO, _ONE)
+        beyond -= nearest
+        beyond *= length[:, k]
+        beyond *= beyond
+        distance *= distance
+        distance += beyond
+        np.sqrt(distance, out=distance)
+        distance -= capsules.radius(k, nearest)
+        np.minimum(gap, distance, out=gap)
+    return _gain(np.maximum(gap, _ZERO, out=gap), taken, width_m)
 
 
-def _from_axis(X: np.ndarray, first: np.ndarray, axis: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, P) along segments, from `first` (N, d) along unit vectors (N, d), that are nearest to X (P, d), and their distances."""
-    along = axis @ X.T
-    along -= np.einsum("nd,nd->n", axis, first)[:, None]
-    squared = np.einsum("pd,pd->p", X, X) + np.einsum("nd,nd->n", first, first)[:, None] - 2 * (first @ X.T)
-    nearest = np.clip(along, 0.0, length[:, None])
-    squared -= nearest * (2 * along - nearest)
-    return nearest, np.sqrt(np.maximum(squared, 0.0, out=squared), out=squared)
+def _gain(gap: np.ndarray, taken: np.ndarray, width_m: float) -> np.ndarray:
+    """The sums (N,) of (2) of one kind, of the distances (N, P) from the nearest capsule."""
+    gain = _weight(gap, width_m)
+    gain -= taken.astype(np.float32)
+    return np.asarray(np.maximum(gain, _ZERO, out=gain).sum(axis=1), dtype=np.float64)
 
 
 def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others: np.ndarray) -> np.ndarray:
@@ -308,8 +352,8 @@ def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others
     flat, shape = X.reshape(-1, 3), X.shape[:-1]
     wrong = np.zeros(shape)
     for view in evidence.cells:
-        depth = view.camera.to_camera(flat)[:, 2]
-        d = view.distance.values(np.nan_to_num(view.camera.project(flat), nan=-1.0))
+        pixels, depth = view.camera.project_with_depth(flat)
+        d = view.distance.values(np.nan_to_num(pixels, nan=-1.0))
         wrong += np.minimum((d * depth / view.camera.focal_px).reshape(shape) / radius, 1.0) / len(evidence.cells)
     if evidence.depths is not None:
         wrong += evidence.depths.far_behind(flat).reshape(shape)

@@ -99,19 +99,14 @@ def near_pairs(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray, bones: 
     That sphere encloses all places within `reach_m` (B,) of the bone's surface.
     """
     bones = np.unique(state.balls.bone_index) if bones is None else bones
-    middle, radius = bone_spheres(state, reach_m, bones)
+    widest = state.profile_table.radii_m[bones].max(axis=(1, 2))
+    half = state.lengths_m[bones] / 2
+    middle = state.head_m[bones] + half[:, None] * state.R[bones, :, 1]
     origin = middle.mean(axis=0)
     X, C = xyz_m - origin, middle - origin
     squares = np.einsum("ni,ni->n", X, X)[:, None] - 2 * X @ C.T + np.einsum("bi,bi->b", C, C)
-    rows, column = np.nonzero(squares <= radius**2)
+    rows, column = np.nonzero(squares <= (half + widest + reach_m[bones]) ** 2)
     return rows, bones[column]
-
-
-def bone_spheres(state: BodyState, reach_m: np.ndarray, bones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (K, 3) and radii (K,) of spheres that enclose all places within `reach_m` (B,) of the surfaces of some bones (K,)."""
-    half = state.lengths_m[bones] / 2
-    middle = state.head_m[bones] + half[:, None] * state.R[bones, :, 1]
-    return middle, half + state.profile_table.radii_m[bones].max(axis=(1, 2)) + reach_m[bones]
 
 
 def facing_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -81,6 +81,11 @@ class Camera:
         """Pixels (…, 2) of world points (…, 3); NaN for points that are not in front of the camera."""
         return self._image(_ahead(self.to_camera(xyz_m)))
 
+    def project_with_depth(self, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (…, 2) of world points (…, 3) as from `project`, and their depths z_cam (…,) [m]."""
+        p = self.to_camera(xyz_m)
+        return self._image(_ahead(p)), p[..., 2]
+
     def project_with_jacobian(self, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (…, 2) and their derivative to the world point (…, 2, 3), analytic."""
         p = _ahead(self.to_camera(xyz_m))

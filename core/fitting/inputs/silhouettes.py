@@ -10,13 +10,14 @@ other way than the limb.
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
 
 from ...geometry.camera import Camera
 from ..observations import SilhouetteRays
-from ..segmentation import SegmentationCache, bone_spheres, facing_bone, owners
+from ..segmentation import SegmentationCache, facing_bone, owners
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
@@ -148,7 +149,16 @@ class Silhouettes:
         def find() -> tuple[np.ndarray, np.ndarray]:
             return touched(rays, state, self._surface, self._settings.outline_gate_m * gate_scale)
 
-        rows, bone = find() if cache is None else cache.get(("rays", t), state, find)
+        if cache is None:
+            return self._observed(rays, state, *find())
+        owners = cache.get(("rays", t), state, find)
+        earlier = cast(list[SilhouetteRays] | None, cache.derived(("rays", t), owners))
+        observed = [one.reweighted(state) for one in earlier] if earlier is not None else self._observed(rays, state, *owners)
+        cache.keep(("rays", t), owners, observed)
+        return observed
+
+    def _observed(self, rays: Rays, state: BodyState, rows: np.ndarray, bone: np.ndarray) -> list[SilhouetteRays]:
+        """Some rays (rows), each with the bone that it touches."""
         if not len(rows):
             return []
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
@@ -216,29 +226,24 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarra
         surface[:, 1] < 1
     )  # its outline continues in fingers, which are no bones
     last = np.where(has_fingers, surface[:, 1], last)
-    rows, bone = _near_pairs(rays, state, gate)
-    X = nearest_to_segment(rays.origin_m[rows], rays.direction[rows], state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone])
+    rows, bone, X = near_rays(rays.origin_m, rays.direction, state, float(gate.max()), np.unique(state.balls.bone_index))
     gap, along, facing = facing_bone(X, rays.outward[rows], state, bone)
     return owners(rows, bone, gap, (along >= first[bone]) & (along <= last[bone]) & facing & (np.abs(gap) < gate[bone]))
 
 
-def _near_pairs(rays: Rays, state: BodyState, reach_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of a ray (K,) and a bone (K,) with balls, ordered by rays, whose sphere (`segmentation.bone_spheres`) the ray meets."""
-    bones = np.unique(state.balls.bone_index)
-    middle, radius = bone_spheres(state, reach_m, bones)
-    o, u = rays.origin_m, rays.direction
-    away = np.einsum("ni,ni->n", o, o)[:, None] - 2 * o @ middle.T + np.einsum("bi,bi->b", middle, middle)
-    along = u @ middle.T - np.einsum("ni,ni->n", o, u)[:, None]
-    rows, column = np.nonzero(away - along**2 <= radius**2)
-    return rows, bones[column]
-
-
-def nearest_to_segment(origin: np.ndarray, direction: np.ndarray, head: np.ndarray, axis: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """The points (N, 3) of rays that come nearest to one segment each: from `head` (N, 3) along the unit vector `axis` (N, 3)."""
-    w = origin - head
-    b, d, e = (np.einsum("ni,ni->n", p, q) for p, q in ((direction, axis), (direction, w), (w, axis)))
+def near_rays(
+    origin: np.ndarray, direction: np.ndarray, state: BodyState, reach_m: float, bones: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of a ray (K,) of those from `origin` (N, 3) along unit vectors (N, 3), and one of some `bones` (K,), ordered by rays, and the
+    point (K, 3) where the ray comes nearest to the bone; without pairs that are further apart than `reach_m` from the bone's surface."""
+    head, axis, length = state.head_m[bones], state.R[bones, :, 1], state.lengths_m[bones]
+    w, b = origin[:, None] - head, direction @ axis.T
+    d, e, squares = np.einsum("nbi,ni->nb", w, direction), np.einsum("nbi,bi->nb", w, axis), np.einsum("nbi,nbi->nb", w, w)
     along = np.clip((e - b * d) / np.maximum(1 - b * b, 1e-9), 0.0, length)
-    return np.asarray(origin + (along * b - d)[:, None] * direction)
+    at = along * b - d
+    reach = state.profile_table.radii_m[bones].max(axis=(1, 2)) + reach_m
+    rows, column = np.nonzero(squares + along * (along - 2 * e) - at * at <= reach * reach)
+    return rows, bones[column], origin[rows] + at[rows, column, None] * direction[rows]
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ A ray belongs to one bone's part, whose field is F. The sigma is that of the con
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from .surface_point import SurfacePoints
 
 MEAN_STEPS, NEWTON_STEPS = 5, 12  # iterations for t* from the closest approach: fixed point, then Newton
 LONGEST_M = 0.01  # of a Newton step: where ln F is hardly curved it would be far too long
-DONE_M = 1e-9  # a step after which there is no other
+DONE_M = 1e-6  # a step of Newton's method after which the error is far below 1e-9 m
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +56,14 @@ class SilhouetteRays(FromBlocks):
             along_m=np.einsum("ni,ni->n", X - origin_m, direction),
         )
 
+    def reweighted(self, reference: BodyState) -> "SilhouetteRays":
+        """The same rays with weights from another reference state."""
+        tangent = self._points(reference).reweighted(reference)
+        along = np.einsum("ni,ni->n", tangent.xyz_m - self.origin_m, self.direction)
+        again = replace(self, tangent=tangent, along_m=along)
+        again._last.append((reference, tangent))
+        return again
+
     def contacts(self, state: BodyState) -> np.ndarray:
         """The points (N, 3) where the field along each ray is largest.  (1)"""
         return _contacts(state, self.origin_m, self.direction, self.bone, self.along_m)
@@ -90,29 +98,50 @@ def _contacts(
 def _largest_field(state: BodyState, bone: np.ndarray, origin: np.ndarray, direction: np.ndarray, start: np.ndarray | None) -> np.ndarray:
     """t* (N,). A ray's field is Σ w exp(−2 (a t² + 2 b t + c)): the balls' shares p give t = −Σ p b / Σ p a; then Newton on ln F."""
     balls, own = balls_of_parts(state.parts)
-    frames, shifts = state.ball_frames
-    flat = frames.transpose(1, 0, 2).reshape(3, -1)
-    o, u = (origin @ flat).reshape(len(origin), -1, 3) - shifts, (direction @ flat).reshape(len(origin), -1, 3)
-    a, b, c = (np.take_along_axis(np.einsum("nmj,nmj->nm", p, q), balls[bone], axis=1) for p, q in ((u, u), (o, u), (o, o)))
-    log_weight = np.where(own[bone], np.log(state.balls.weight)[balls[bone]], -np.inf)
+    a, b, c = (np.take_along_axis(v, balls[bone], axis=1) for v in _quadratics(state, origin, direction))
     nearest = -b / a
-    least = c + b * nearest  # d where the ball is nearest
+    log_least = np.where(own[bone], np.log(state.balls.weight)[balls[bone]], -np.inf) - 2 * (c + b * nearest)  # where the ball is nearest
 
-    def shares(t: np.ndarray) -> np.ndarray:
-        log_terms = log_weight - 2 * (least + a * (t[:, None] - nearest) ** 2)
-        terms = np.exp(log_terms - log_terms.max(axis=1, keepdims=True))
-        return np.asarray(terms / terms.sum(axis=1, keepdims=True))
+    def shares(t: np.ndarray, rays: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        beyond = t[:, None] - nearest[rays]
+        slopes = a[rays] * beyond
+        log_terms = log_least[rays] - 2 * slopes * beyond
+        log_terms -= log_terms.max(axis=1, keepdims=True)
+        terms = np.exp(log_terms, out=log_terms)
+        terms /= terms.sum(axis=1, keepdims=True)
+        return terms, slopes
 
-    t = nearest[np.arange(len(origin)), np.argmax(log_weight - 2 * least, axis=1)] if start is None else start
+    def mean(p: np.ndarray, rays: np.ndarray | slice) -> np.ndarray:
+        weights = p * a[rays]
+        return np.asarray((weights * nearest[rays]).sum(axis=1) / weights.sum(axis=1))
+
+    t = nearest[np.arange(len(origin)), np.argmax(log_least, axis=1)] if start is None else start
     for _ in range(MEAN_STEPS if start is None else 1):
-        p = shares(t)
-        t = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
+        t = mean(shares(t, np.s_[:])[0], np.s_[:])
+    left = np.arange(len(t))  # rays that have not converged
     for _ in range(NEWTON_STEPS):
-        p, slopes = shares(t), -4 * (a * t[:, None] + b)
-        slope = (p * slopes).sum(axis=1)
-        curve = (p * (slopes**2 - 4 * a)).sum(axis=1) - slope**2
-        mean = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
-        t, before = np.where(curve < 0, t + np.clip(-slope / np.where(curve < 0, curve, 1.0), -LONGEST_M, LONGEST_M), mean), t
-        if np.abs(t - before).max(initial=0.0) < DONE_M:
+        p, slopes = shares(t[left], left)
+        slope = (p * slopes).sum(axis=1)  # of ln F, in units of −4
+        curve = (p * (4 * slopes**2 - a[left])).sum(axis=1) - 4 * slope**2  # in units of 4
+        newton = np.clip(slope / np.where(curve < 0, curve, -1.0), -LONGEST_M, LONGEST_M)
+        step = np.where(curve < 0, newton, mean(p, left) - t[left])
+        t[left] += step
+        left = left[np.abs(step) >= DONE_M]
+        if not len(left):
             break
     return np.asarray(t)
+
+
+def _quadratics(state: BodyState, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """a, b and c (N, M) of the distances a t² + 2 b t + c of rays from all balls: linear in the products of their coordinates."""
+    frames, shifts = state.ball_frames
+    i, j = np.triu_indices(3)
+    form = (np.matmul(frames, frames.transpose(0, 2, 1))[:, i, j] * np.where(i == j, 1.0, 2.0)).T  # (6, M)
+    shifted = np.einsum("mij,mj->im", frames, shifts)
+    o, u = origin, direction
+    both = (o[:, i] * u[:, j] + o[:, j] * u[:, i]) / 2
+    return (
+        (u[:, i] * u[:, j]) @ form,
+        both @ form - u @ shifted,
+        (o[:, i] * o[:, j]) @ form - 2 * o @ shifted + np.einsum("mi,mi->m", shifts, shifts),
+    )

@@ -138,8 +138,38 @@ class Linearised:
         return before.renewed(self.residuals)
 
 
-def linearise(problem: Problem, at: Estimate, factors: Scales | None = None) -> Linearised:
-    """Weights, cost and normal equations at a motion and shape vector.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observed:
+    """All observations of the frames and of the steps between them, made at one motion and shape."""
+
+    frames: list[list[Observation]]  # T
+    steps: list[MaterialSteps | None]  # T − 1
+
+
+def observed(problem: Problem, at: Estimate) -> Observed:
+    """The observations at a motion and shape vector.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    states, frames, steps = problem.parameters.states(at.motion, at.vector), [], []
+    for t, state in enumerate(states):
+        problem.monitor.check()
+        frames.append(problem.observe(t, state))
+    for t, (a, b) in enumerate(zip(states, states[1:])):
+        problem.monitor.check()
+        steps.append(_step(problem, t, a, b))
+    return Observed(frames=frames, steps=steps)
+
+
+def _step(problem: Problem, t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+    return problem.observe_step(t, a, b) if problem.observe_step is not None else None
+
+
+def linearise(problem: Problem, at: Estimate, factors: Scales | None = None, given: Observed | None = None) -> Linearised:
+    """Weights, cost and normal equations at a motion and shape vector, of the observations there, which may be `given`.
+
+    Those that are not given are made frame by frame: what was evaluated for them is released before the next frame is observed.
 
     `factors`: variance factors of the kinds of observations (`variance_factors`), for covariances only.
 
@@ -152,10 +182,10 @@ def linearise(problem: Problem, at: Estimate, factors: Scales | None = None) -> 
     states = problem.parameters.states(at.motion, at.vector)
     for t, state in enumerate(states):
         problem.monitor.check()
-        _add_frame(problem, lin, t, state, at.scales, factors)
-    for t in range(T - 1):
+        _add_frame(problem, lin, t, state, given.frames[t] if given else problem.observe(t, state), at.scales, factors)
+    for t, (a, b) in enumerate(zip(states, states[1:])):
         problem.monitor.check()
-        _add_step(problem, lin, t, states[t], states[t + 1], at.scales.steps, factors.steps)
+        _add_step(problem, lin, t, a, b, given.steps[t] if given else _step(problem, t, a, b), at.scales.steps, factors.steps)
     for o in problem.shape_observations if len(problem.free_shape) else ():
         r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, layout.shape_columns(problem.free_shape)], problem.shape_weight
         lin.equations.corner += w * J.T @ J
@@ -189,27 +219,26 @@ def variance_factors(problem: Problem, at: Estimate) -> Scales:
         **{
             kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
             * max(1.0, scales.of(kind) / LARGEST_SCALE.get(kind, np.inf)) ** 2
-            for kind, r in _residuals(problem, at).items()
+            for kind, r in _residuals(problem, at, observed(problem, at)).items()
             if r
         }
     )
 
 
-def first_scales(problem: Problem, start: Estimate) -> Scales:
-    """The scales of the residuals before the first step."""
-    return start.scales.renewed(_residuals(problem, start))
+def first_scales(problem: Problem, start: Estimate, given: Observed) -> Scales:
+    """The scales of the residuals of the observations before the first step."""
+    return start.scales.renewed(_residuals(problem, start, given))
 
 
-def _residuals(problem: Problem, at: Estimate) -> dict[str, list[np.ndarray]]:
+def _residuals(problem: Problem, at: Estimate, given: Observed) -> dict[str, list[np.ndarray]]:
     """The residuals of robust observations, by kind."""
     states, residuals = problem.parameters.states(at.motion, at.vector), dict[str, list[np.ndarray]]()
-    for t, state in enumerate(states):
+    for state, frame in zip(states, given.frames):
         problem.monitor.check()
-        for o in problem.observe(t, state):
+        for o in frame:
             if o.kind:
                 residuals.setdefault(o.kind, []).append(o.residual(state))
-    for t, (a, b) in enumerate(zip(states, states[1:])):
-        step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
+    for a, b, step in zip(states, states[1:], given.steps):
         if step is not None:
             residuals.setdefault("steps", []).append(step.residual(a, b))
     return residuals
@@ -223,9 +252,11 @@ def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterab
     return [(np.arange(len(J)), np.arange(J.shape[1]), J)]
 
 
-def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scales: Scales, factor: Scales) -> None:
+def _add_frame(
+    problem: Problem, lin: Linearised, t: int, state: BodyState, observations: list[Observation], scales: Scales, factor: Scales
+) -> None:
     e, free, frame = lin.equations, problem.free_shape, []
-    for o in problem.observe(t, state):
+    for o in observations:
         r = o.residual(state)
         w: np.ndarray | float = 1.0
         if o.kind:
@@ -246,8 +277,9 @@ def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scal
     lin.observations.append(frame)
 
 
-def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodyState, scale: float, factor: float) -> None:
-    step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
+def _add_step(
+    problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodyState, step: MaterialSteps | None, scale: float, factor: float
+) -> None:
     if step is None:
         lin.steps.append(None)
         return

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...foundation.progress import Monitor
 from .block_band import NormalEquations
-from .problem import Estimate, Linearised, Problem, cost, first_scales, linearise
+from .problem import Estimate, Linearised, Observed, Problem, cost, first_scales, linearise, observed
 
 START_DAMPING = 1e-3  # λ
 LARGEST_DAMPING = 1e8  # of λ: from here on no step lowers the cost
@@ -59,13 +59,14 @@ def solve(
         Cancelled: the user asked to stop.
     """
     now = Estimate(motion=np.array(start.motion, dtype=np.float64), vector=np.array(start.vector, dtype=np.float64), scales=start.scales)
-    now = replace(now, scales=first_scales(problem, now))
+    given: Observed | None = (first := observed(problem, now))
+    now = replace(now, scales=first_scales(problem, now, first))
     damping, done, iteration, last, slight = START_DAMPING, False, 0, float("nan"), 0
     while iteration < steps and not done:
         if monitor is not None:
             monitor.step(stage, iteration, steps)
         iteration += 1
-        lin = linearise(problem, now)
+        lin, given = linearise(problem, now, given=given), None
         last = lin.cost
         new, damping = _accepted_step(problem, lin, now, damping, furthest)
         if new is None:

@@ -12,7 +12,7 @@ from ..inputs.cloud_points import CloudPoints
 from ..limb import halton
 from ..observations import Observation
 from ..observations.shape_priors import clicked_chains
-from ..segmentation import crop
+from ..segmentation import SegmentationCache, crop
 from ..solve.problem import Estimate, linearise
 from ..solve.solver import FURTHEST, Solution, solve
 from ..state import BodyState
@@ -197,8 +197,9 @@ def _best_starts(fit: FitContext, points: CloudPoints, starts: list[np.ndarray],
 
 
 def _observe(fit: FitContext, points: CloudPoints, gate_scale: float) -> Callable[[int, BodyState], list[Observation]]:
+    cache = SegmentationCache()
     return lambda t, state: [
-        *fit.surface_observations(fit.click, points, state, gate_scale),
+        *fit.surface_observations(fit.click, points, state, gate_scale, cache),
         *fit.joints(fit.click),
         *fit.pose_observations(state),
     ]

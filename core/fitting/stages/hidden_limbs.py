@@ -82,10 +82,13 @@ def _search(evidence: Evidence, limb: Limb, now: np.ndarray, vector: np.ndarray,
     for k, (count, spread, width, most) in enumerate(ROUNDS):
         monitor.step(SEARCH, k, len(ROUNDS))
         around = [limb.poses(pose, limb.samples(pose[limb.columns], count, np.radians(spread))) for pose in best]
-        tried = np.concatenate([best, *around])
-        gain = limb_gains(evidence if k else evidence.thinned(), limb, tried, vector, width)
+        tried, seen = np.concatenate(around), evidence if k else evidence.thinned()
+        gain = limb_gains(seen, limb, best, vector, width)
+        present = -np.inf if k else float(gain[0])  # of the coarse poses, only those that explain more go on
+        gain = np.concatenate([gain, limb_gains(seen, limb, tried, vector, width, present)])
         order = np.argsort(-gain, kind="stable")[:most]
-        best, gain = tried[order], gain[order]
-        if not k and order[0] == 0:  # nothing in the joints' range explains more than the present pose
+        if not k and order[0] == 0:
             return None
+        order = order[gain[order] >= present]
+        best, gain = np.concatenate([best, tried])[order], gain[order]
     return best[0] if gain[0] > have + least else None

@@ -73,12 +73,15 @@ def _modes(limb: Limb, near: Evidence, pose: np.ndarray, vector: np.ndarray) -> 
     """The poses of one frame that differ, the fitted one first, the others from the best on."""
     own = pose[limb.columns][None]
     tried = np.concatenate([own, limb.samples(own[0], AROUND, AROUND_RAD), limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
-    poses = limb.poses(pose, tried)
-    coarse, ends = limb_gains(near.thinned(), limb, poses, vector, COARSE_M), limb.ends(poses, vector)
+    poses, thinned = limb.poses(pose, tried), near.thinned()
+    now = limb_gains(thinned, limb, poses[:1], vector, COARSE_M)
+    least = now[0] - HOPELESS * GAIN
+    coarse, ends = np.concatenate([now, limb_gains(thinned, limb, poses[1:], vector, COARSE_M, least)]), limb.ends(poses, vector)
     far = np.linalg.norm(ends - ends[0], axis=2).max(axis=1) > FROM_OWN_M
-    if coarse[far].max(initial=-np.inf) < coarse[0] - HOPELESS * GAIN:
+    if coarse[far].max(initial=-np.inf) <= least:
         return LimbModes(angles=own, ends_m=ends[:1], gain=coarse[:1])
-    best = tried[1:][np.argsort(-coarse[1:], kind="stable")]
+    order = np.argsort(-coarse[1:], kind="stable")
+    best = tried[1:][order[coarse[1:][order] > least]]
     more = [limb.samples(angles, IMPROVEMENTS, IMPROVED_RAD) for angles in best[:IMPROVED]]
     tried = np.concatenate([own, *more, best[: 4 * MODES]])
     poses = limb.poses(pose, tried)

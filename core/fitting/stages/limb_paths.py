@@ -228,9 +228,11 @@ def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, ne
     own = pose[limb.columns][None]
     around = [limb.samples(a, AROUND, AROUND_RAD) for a in ahead[np.argsort(ways.cost, kind="stable")[:NEAR_WAYS]]]
     going_on = np.concatenate([ways.angles, ahead, own, *around])
-    tried = np.concatenate([going_on, limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
-    coarse = limb_gains(near.thinned(), limb, limb.poses(pose, tried), vector, COARSE_M)
-    best = tried[np.argsort(-coarse, kind="stable")[:IMPROVED]]
+    anywhere, thinned = limb.samples(own[0], ANYWHERE, ANYWHERE_RAD), near.thinned()
+    coarse = limb_gains(thinned, limb, limb.poses(pose, going_on), vector, COARSE_M)
+    least = np.sort(coarse)[-IMPROVED]
+    coarse = np.concatenate([coarse, limb_gains(thinned, limb, limb.poses(pose, anywhere), vector, COARSE_M, least)])
+    best = np.concatenate([going_on, anywhere])[np.argsort(-coarse, kind="stable")[:IMPROVED]]
     tried = np.concatenate([going_on, best, *(limb.samples(a, IMPROVEMENTS, IMPROVED_RAD) for a in best)])
     poses = limb.poses(pose, tried)
     gain, ends = limb_gains(near, limb, poses, vector, FINE_M), limb.ends(poses, vector)

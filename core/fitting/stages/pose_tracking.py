@@ -285,7 +285,8 @@ def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monito
 
     begin = Estimate(motion=start[None], vector=vector, scales=given.first.scales)
     pose = solve(fit.problem(observe), begin, steps=fit.settings.frame_steps, monitor=monitor).motion[0]
-    return pose, fit.support(i, points, pose, vector), fit.score(i, points, pose, vector)
+    support = fit.support(i, points, pose, vector)
+    return pose, support, fit.score(i, points, pose, vector, support)
 
 
 def _alone(given: PoseTracking, t: int, start: np.ndarray) -> TargetPose:

@@ -7,7 +7,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, scaled_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.inputs.clicks import initial_clicks, read_clicks
-from tricap.core.fitting.inputs.silhouettes import Rays, touched
+from tricap.core.fitting.inputs.silhouettes import Rays, near_rays, touched
 from tricap.core.fitting.observations import Proportions
 from tricap.core.fitting.observations.shape_priors import clicked_chains, proportions
 from tricap.core.fitting.stages.inverse_kinematics import clicked_stature, dof_priors
@@ -118,6 +118,30 @@ def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the
 
     assert owners("hand.R", 0.6).tolist() == [at["hand.R"]] and not len(owners("hand.R", 1.2))
     assert owners("head", 1.1).tolist() == [at["head"]]
+
+
+def test_pairs_of_rays_and_bones_are_those_within_reach(full) -> None:
+    """Against places all along both."""
+    parameters, rng = ShapeParameters(default_shape(full)), np.random.default_rng(3)
+    state = parameters.state(np.zeros(len(full.skeleton.dofs)), parameters.vector())
+    bones = np.unique(state.balls.bone_index)
+    origin = np.array([0.0, -3.0, 1.0]) + rng.normal(0, 0.1, (40, 3))
+    direction = state.head_m[rng.choice(bones, 40)] + rng.normal(0, 0.1, (40, 3)) - origin
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rows, bone, X = near_rays(origin, direction, state, 0.05, bones)
+    assert (np.diff(rows) >= 0).all()
+    t, share = np.linspace(2.0, 4.0, 401), np.linspace(0.0, 1.0, 51)
+    found = set(zip(rows.tolist(), bone.tolist()))
+    for b in bones.tolist():
+        segment = state.head_m[b] + (share * state.lengths_m[b])[:, None] * state.R[b, :, 1]
+        reach = state.profile_table.radii_m[b].max() + 0.05
+        for n in range(40):
+            along = origin[n] + t[:, None] * direction[n]
+            away = np.linalg.norm(along[:, None] - segment[None], axis=2).min()
+            if abs(away - reach) > 0.005:
+                assert ((n, b) in found) == (away < reach)
+    nearest = np.einsum("ki,ki->k", X - origin[rows], direction[rows])
+    np.testing.assert_allclose(X, origin[rows] + nearest[:, None] * direction[rows], atol=1e-12)
 
 
 @pytest.mark.parametrize("small", [0.7, 0.88, 1.0])

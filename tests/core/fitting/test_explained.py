@@ -119,6 +119,19 @@ def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
 
 
+def test_gains_above_the_least_are_exact_and_the_others_are_not_above_it(fit) -> None:
+    limb, vector = _arm(fit), _vector(fit)
+    near = fit.seen(4, NOTHING).near(limb, fit.parameters.state(POSES[4], vector))
+    poses = limb.poses(POSES[4], limb.samples(POSES[4][limb.columns], 200, np.pi))
+    exact = limb_gains(near, limb, poses, vector, 0.03)
+    for least in np.quantile(exact, [0.5, 0.95]):
+        bound = limb_gains(near, limb, poses, vector, 0.03, float(least))
+        above = exact > least
+        assert above.any() and not above.all()
+        np.testing.assert_allclose(bound[above], exact[above], atol=1e-3)
+        assert (bound[~above] <= least + 1e-3).all() and (bound > exact - 1e-3).all()
+
+
 def test_rims_of_the_rest_of_the_body_are_no_limb(fit) -> None:
     """Cells of which the body explains all but a little are not the arm's, wherever it lies; all of them together would be."""
     limb, vector, pose = _arm(fit), _vector(fit), POSES[4:5]

@@ -23,6 +23,7 @@ from tricap.core.fitting.observations import (
     Symmetry,
 )
 from tricap.core.fitting.observations.background import DistanceMap
+from tricap.core.fitting.part_field import PartField
 from tricap.core.fitting.solve.block_band import NormalEquations
 from tricap.core.fitting.solve.time_priors import Acceleration
 from tricap.core.fitting.state import ShapeParameters
@@ -250,6 +251,29 @@ def test_fields_are_released_after_their_derivatives_and_evaluated_again() -> No
     assert not points._last and np.array_equal(points.residual(state), before) and points._last
     again = points.reweighted(state)
     assert again._last and not points._last and np.array_equal(again.jacobian(state), J)
+
+
+def test_reweighted_rays_are_those_made_anew() -> None:
+    parameters, rng = _parameters("full"), np.random.default_rng(8)
+    first = parameters.state(_motion(parameters, rng), parameters.vector())
+    rays = next(c for c in _cases(parameters, first, rng) if isinstance(c, SilhouetteRays))
+    other = parameters.state(first.motion + 0.002, parameters.vector())
+    anew = SilhouetteRays.about(other, origin_m=rays.origin_m, direction=rays.direction, bone=rays.bone, sigma_m=rays.sigma_m)
+    again = rays.reweighted(other)
+    np.testing.assert_allclose(again.contacts(other), anew.contacts(other), atol=1e-8)
+    np.testing.assert_allclose(again.residual(other), anew.residual(other), atol=1e-5)
+    np.testing.assert_allclose(again.jacobian(other), anew.jacobian(other), atol=1e-3)
+
+
+def test_the_field_is_largest_where_rays_touch() -> None:
+    parameters, rng = _parameters("full"), np.random.default_rng(9)
+    state = parameters.state(_motion(parameters, rng), parameters.vector())
+    rays = next(c for c in _cases(parameters, state, rng) if isinstance(c, SilhouetteRays))
+    there = rays.contacts(state)
+    for b in np.unique(rays.bone).tolist():
+        rows = rays.bone == b
+        F = [PartField(state.parts[b], state, there[rows] + d * rays.direction[rows]).F for d in (-1e-3, 0.0, 1e-3)]
+        assert (F[1] >= F[0]).all() and (F[1] >= F[2]).all()
 
 
 def test_what_was_evaluated_at_a_state_is_not_used_at_another() -> None:
