@@ -17,6 +17,7 @@ from ..images.interlace import RowGrid
 
 REACH_M = 0.55  # m, a body's extent in depth beyond clicked joints
 NEAREST_M = 0.05  # m, smallest depth of all
+NEARER = 0.5  # of the smallest depth of the person: no nearer is looked for in the next frame
 SPEED_M_S = 2.0  # m/s in depth, of a walking person
 MARGIN_M = 0.30  # m that a person may move in depth between frames, and by which a limb may exceed the cloud of the frame before
 FURTHEST_LIMB_M = 1.2  # m in front of the middle of a person's depths
@@ -127,7 +128,7 @@ def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, c
         return before
     low, high = (float(depth) for depth in np.percentile(depth_m, CLOUD_PERCENT))
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
-    near, latest = max(NEAREST_M, low - MARGIN_M), -np.inf
+    near, latest = max(NEAREST_M, NEARER * low, low - MARGIN_M), -np.inf
     if not confirmed:
         middle = float(depth_m[np.argmax(_neighbours(np.log(np.maximum(depth_m, NEAREST_M))))])
         near, latest = max(near, middle - FURTHEST_LIMB_M), middle + 2 * MARGIN_M

@@ -39,6 +39,9 @@ DENSE_PATCH_PX = 9  # side of the largest patch of which all pixels are compared
 SWEEP_SMOOTHING_PX = 1.0  # px, sigma of the Gaussian: finer details would be noise to every other pixel
 LARGEST_SHAPE = 30.0  # pixels of a view over those of the reference
 MIN_SAMPLES = 8  # of a ray
+PROJECTED_EVERY = 8  # samples of a ray
+FASTEST_PX = 4.0  # from sample to sample, where a search image is followed smoothly
+CUBIC = 4  # values of a cubic
 MAX_SAMPLES = 1200
 LOOK_UP = 30_000_000  # grey values interpolated per block
 CORRELATED = 16_384  # patches correlated at once
@@ -78,6 +81,41 @@ def _image_of(camera: Camera, rows: RowGrid, corners: np.ndarray) -> tuple[np.nd
     shape = np.stack([image[..., 1, :] - image[..., 0, :], image[..., 2, :] - image[..., 0, :]], axis=-1)
     plausible = (np.abs(shape) <= LARGEST_SHAPE).all(axis=(-2, -1))
     return np.where(plausible[..., None], image[..., 0, :], np.nan), shape
+
+
+def _along_rays(views: Views, k: int, xy: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`_image_of` in view k of the patches about points (m, 2) at inverse depths (D,): positions (m, D, 2) and shapes (m, D, 2, 2).
+
+    Along a ray both are smooth: they are computed at every `PROJECTED_EVERY`th sample and interpolated by cubics; of rays where they are
+    not, near the plane of the camera, at every sample.
+    """
+    m, D = len(xy), len(inverse)
+
+    def exactly(points: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _image_of(views.cameras[k], views.rows, _corners(views.base, views.rows, points, 1 / w[None]))
+
+    knots = np.linspace(inverse[0], inverse[-1], max(CUBIC, 1 + -(-(D - 1) // PROJECTED_EVERY)))
+    if len(knots) >= D:
+        return exactly(xy, inverse)
+    c, A = exactly(xy, knots)
+    smooth = np.abs(np.diff(c, axis=1)).max(axis=(1, 2)) < PROJECTED_EVERY * FASTEST_PX  # False for NaN
+    weights = _cubic_weights((inverse - knots[0]) / (knots[1] - knots[0]), len(knots))
+    both = np.concatenate([c, A.reshape(m, -1, 4)], axis=2)
+    found = np.einsum("dn,mnc->mdc", weights, np.where(smooth[:, None, None], both, 0.0), optimize=True)
+    at, shape = found[..., :2], found[..., 2:].reshape(m, D, 2, 2)
+    if not smooth.all():
+        at[~smooth], shape[~smooth] = exactly(xy[~smooth], inverse)
+    return at, shape
+
+
+def _cubic_weights(x: np.ndarray, n: int) -> np.ndarray:
+    """Weights (D, n) of n values at 0, 1, … for the cubics through four neighbours each, at places x (D,) (Lagrange)."""
+    first = np.clip(np.floor(x).astype(int) - 1, 0, n - CUBIC)
+    rows, weights = np.arange(len(x)), np.zeros((len(x), n))
+    for i in range(CUBIC):
+        others = [j for j in range(CUBIC) if j != i]
+        weights[rows, first + i] = np.prod([(x - first - j) / (i - j) for j in others], axis=0)
+    return weights
 
 
 def sweep_seeds(
@@ -189,8 +227,8 @@ def _default_range(views: Views) -> tuple[float, float]:
 
 def _inverse_depths(views: Views, near: float, far: float) -> np.ndarray:
     """Inverse depths from far to near, so that the fastest search image moves by about SWEEP_STEP_PX."""
-    centres = np.stack([c.centre_m for c in views.cameras])
-    speed = np.linalg.norm(centres - centres[views.reference], axis=1).max() * views.base.focal_px
+    centres = np.stack([views.cameras[k].centre_m for k in views.search])
+    speed = np.linalg.norm(centres - views.base.centre_m, axis=1).max() * views.base.focal_px
     count = int(np.clip(speed * (1 / near - 1 / far) / SWEEP_STEP_PX, MIN_SAMPLES, MAX_SAMPLES))
     return np.linspace(1 / far, 1 / near, count)
 
@@ -202,10 +240,9 @@ def _sweep_correlations(views: Views, settings: MatchingSettings, xy: np.ndarray
     sampled = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > DENSE_PATCH_PX else np.ones(len(u), dtype=bool)
     u, v = u[sampled], v[sampled]
     f = _normalised(views.template.look_up((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
-    corners = _corners(views.base, views.rows, xy, 1 / inverse[None])
     found = []
     for k in views.search:
-        c, A = (a.reshape(m * D, *a.shape[2:]) for a in _image_of(views.cameras[k], views.rows, corners))
+        c, A = (a.reshape(m * D, *a.shape[2:]) for a in _along_rays(views, k, xy, inverse))
         inside = views.images[k].inside(c, np.array(half))
         rho = np.full(m * D, np.nan)
         rho[inside] = _correlations(views.images[k], c[inside], A[inside], f, np.repeat(np.arange(m), D)[inside], u, v)
