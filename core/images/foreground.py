@@ -32,6 +32,7 @@ LEAST_NOISE = 0.3  # grey values
 ROWS = 64  # of cells, processed at a time
 SAME_LOOK, MANY = 1.5, 0.2  # times the noise: what differs less looks the same; the share of the cells around that do
 LINGERING = 0.3  # c of a cell near which there was always a person
+UNEVEN, UNEVEN_SHARE = 1.5, 0.02  # times the noise, and of all cells: where fewer have so much, the person has added it
 STRAY, SAME = 0.02, 0.05  # ε: shadows and the like; δ of (1)
 LEAST_DIFFERENCE = 3.0  # s over the noise
 ODDS = (-3.0, 5.0)  # bounds of the logarithm in (2)
@@ -97,7 +98,8 @@ def still_background(
 
 
 def _sigma(images: Sequence[np.ndarray], near: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> np.ndarray:
-    """The noise (h, w) of each cell and those around: the upper quartile of its differences while nobody is near."""
+    """The noise (h, w) of each cell and those around, by the upper quartile of its differences while nobody is near; the same for all cells
+    unless many of them have more."""
     sigma, lights = np.empty(grey.shape, np.float32), [_light(image - grey, grey, noise) for image in images]
     for row in range(0, len(grey), ROWS):
         part = slice(row, row + ROWS)
@@ -107,7 +109,8 @@ def _sigma(images: Sequence[np.ndarray], near: Sequence[np.ndarray], grey: np.nd
         shown = np.isfinite(ascending).sum(axis=0)
         quartile = np.take_along_axis(ascending, np.maximum(shown - 1, 0)[None] * 3 // 4, axis=0)[0]
         sigma[part] = np.where(shown > 0, quartile, 0.0) / NORMAL_UPPER
-    return np.maximum(cv2.GaussianBlur(sigma, (0, 0), RADIUS), noise)
+    sigma = np.maximum(cv2.GaussianBlur(sigma, (0, 0), RADIUS), noise)
+    return sigma if np.mean(sigma > UNEVEN * noise) > UNEVEN_SHARE else np.full(grey.shape, noise)
 
 
 def _second_look(images: Sequence[np.ndarray], seen: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:

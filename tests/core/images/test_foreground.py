@@ -63,7 +63,7 @@ def test_a_person_in_cloth_as_bright_as_the_wall_is_found_about_a_few_measured_p
     true, seen = _ellipse(70), np.zeros(SIZE, dtype=bool)
     seen[20:72:4, 60:82:3] = True
     assert abs(float((plain - WALL)[true].mean())) < 0.5 and (np.abs(plain - WALL)[true] < 2 * NOISE).mean() > 0.7
-    background = _background(images, near=[_near(x) for x in np.linspace(20, 120, len(images))])
+    background = _background(images)
     found = person(background, images[6], seen & true)
     assert _iou(found, true) > 0.8 and not np.asarray(found)[:, :40].any()
     assert _iou(person(background, images[6], NOBODY), true) < 0.7
