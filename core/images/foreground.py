@@ -40,7 +40,13 @@ SEEN = 4.0  # of a cell with measured points
 COUPLING, RADIUS, ROUNDS = 6.0, 2.0, 10  # w of (2), sigma of G in cells, iterations
 SMALLEST = 60  # cells of a region
 NORMAL_QUARTILE, NORMAL_UPPER = 0.3186, 1.1503  # lower and upper quartile of |N(0, 1)|
-GAIN_CELLS, GAIN_STEPS, GAIN_PRIOR = 4000, 10, 1e4  # of a gain: cells, iterations, and weight of 0 (grey values² over the noise's)
+GAIN_CELLS, GAIN_STEPS, GAIN_PRIOR = (
+    4000,
+    10,
+    1e4,
+)  # of a gain: cells, iterations with each weight, weight of 0 (grey values² over the noise's)
+GAIN_WIDTH = 3.0  # times the noise, of the second weight
+LEAST_GAIN = 0.25  # times the noise, of what a gain changes (root mean square): the person adds up to 0.15
 OTHER_LIGHT = 4.0  # times the noise: the difference of so large a share is not noise
 
 
@@ -176,17 +182,23 @@ def person(background: CellBackground, image: np.ndarray, seen: np.ndarray) -> n
 
 
 def _light(difference: np.ndarray, grey: np.ndarray, noise: float, comparable: np.ndarray | slice = np.s_[:]) -> tuple[float, float]:
-    """What another light adds to the differences (h, w) from a background `grey`: gain · grey + offset, by least absolute residuals."""
+    """What another light adds to the differences (h, w) from a background `grey`: gain · grey + offset.
+
+    By least absolute residuals, then with weights that leave out the person (Geman-McClure).
+    """
     d, g = difference[comparable].ravel(), grey[comparable].ravel()
     every = 1 + len(d) // GAIN_CELLS
     some, level = d[::every].astype(np.float64), g[::every].astype(np.float64)
     level = level - level.mean()
     gain, offset = 0.0, float(np.median(some))
-    for _ in range(GAIN_STEPS):
-        w = 1 / np.maximum(np.abs(some - offset - gain * level), noise)
+    for step in range(2 * GAIN_STEPS):
+        r = np.abs(some - offset - gain * level) / noise
+        w = 1 / np.maximum(r, 1.0) if step < GAIN_STEPS else 1 / (1 + (r / GAIN_WIDTH) ** 2) ** 2
         m = (w * level).sum() / w.sum()
         offset = float((w * some).sum() / w.sum() - gain * m)
         gain = float((w * (level - m) * some).sum() / ((w * (level - m) ** 2).sum() + GAIN_PRIOR))
+    if abs(gain) * level.std() < LEAST_GAIN * noise:
+        gain = 0.0
     return gain, _of_light(d - gain * g, noise)
 
 
