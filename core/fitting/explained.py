@@ -40,6 +40,7 @@ CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other 
 BEHIND_M = 0.06  # a limb so far before measured points would hide them
 CELL_OF_DEPTH_M = 0.03
 _ZERO, _ONE = np.float32(0), np.float32(1)  # numpy is slower with numbers of another type
+FAR_AWAY_M = 1e6  # instead of an infinite distance, which products of matrices do not bear
 LARGEST_PX = 1e6  # of an end of a bone in an image: in the plane of a camera a projection has no limit
 
 
@@ -281,7 +282,7 @@ def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray,
     """(2) of points in N poses (N,), in single precision: products of matrices give what is linear in 1, X and X² of all pairs."""
     origin = capsules.first_m[0, 0]  # numbers are small from here
     X, normals = (v.astype(np.float32) for v in (points.xyz_m - origin, points.normals))
-    along_normal = np.where(normals.any(axis=1), np.einsum("pi,pi->p", X, normals), np.inf)  # an unknown normal points outwards
+    along_normal = np.where(normals.any(axis=1), np.einsum("pi,pi->p", X, normals), FAR_AWAY_M)  # an unknown normal points outwards
     places = np.column_stack([X, np.ones(len(X)), np.einsum("pi,pi->p", X, X), normals, along_normal]).astype(np.float32).T
     gap = np.full((len(capsules.first_m), len(X)), np.inf, np.float32)
     for k, length in enumerate(capsules.length_m.astype(np.float32)):
@@ -318,7 +319,7 @@ def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, wi
     along, across = (
         np.concatenate([v, -np.einsum("nkd,nkd->nk", v, a)[..., None]], axis=-1).astype(np.float32) for v in (ab / size**2, normal)
     )
-    across[~visible] = 0.0, 0.0, np.inf
+    across[~visible] = 0.0, 0.0, FAR_AWAY_M
     length = (size * metres[..., None]).astype(np.float32)
     xy = np.column_stack([view.xy_px - centre, np.ones(len(view.xy_px))]).astype(np.float32).T
     for k in range(len(capsules.length_m)):
