@@ -14,6 +14,7 @@ from tricap.core.body.skeleton import joint_positions
 from tricap.core.body.skin.contour_skin import limb_skin
 from tricap.core.fitting.inputs.no_surface import background_outside_outlines, filled, outline_polygons
 from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.raster import rasterize
 from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
@@ -87,6 +88,25 @@ def test_outlines_alone_and_nothing_is_measured_where_it_is_not_wanted(tmp_path:
     job = pipeline.run(take, out, {"fitting": {"use_surface": False}})
     assert job.body is not None and np.linalg.norm(job.body.motion.joints_m - _joints(), axis=2).max() < 0.02
     assert _run(out)["stages"]["measure"]["not_done"] == "fitting.use_surface is false"
+
+
+def test_between_cameras_all_around_nothing_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless no body is wanted: then the surface is all there is, and is tried."""
+
+    def tried(*args: Any) -> None:
+        raise InputError("tried")
+
+    monkeypatch.setattr(pipeline, "measure_frames", tried)
+    takes = {
+        model: write_take(tmp_path / model, three_cameras(base_m=6.0), [[]], more=f'[body]\nmodel = "{model}"\n')
+        for model in ("arm.R", "none")
+    }
+    with take_run.open_run(takes["arm.R"], tmp_path / "out") as job:
+        pipeline.measure(job, Monitor())
+        assert job.surfaceless and any("no surface is measured" in w for w in job.record["warnings"])
+    assert _run(tmp_path / "out")["stages"]["measure"]["not_done"] == "the views look from too far apart"
+    with take_run.open_run(takes["none"], tmp_path / "surface") as job, pytest.raises(InputError, match="tried"):
+        pipeline.measure(job, Monitor())
 
 
 def test_what_lies_outside_an_outline_is_empty(tmp_path: Path) -> None:
