@@ -202,11 +202,10 @@ class FitContext:
             monitor=self.monitor,
         )
 
-    def shaped_by(self, points: CloudPoints) -> "FitContext":
-        """The context of an adjustment of the shape: without outlines against the background, which are less exact than measured points,
-        unless there are no points.
-        """
-        return replace(self, silhouettes=self.silhouettes.drawn_only()) if len(points.xyz_m) else self
+    def shaped(self, measured: bool) -> "FitContext":
+        """The context of an adjustment of the shape: where points were measured, without outlines against the background, which are less
+        exact."""
+        return replace(self, silhouettes=self.silhouettes.drawn_only()) if measured else self
 
     def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """How many points and rays of frame index `t` a body explains: the sum of their robust weights for a width of `SUPPORT_SIGMA_M`."""

@@ -100,7 +100,7 @@ def _along_rays(views: Views, k: int, xy: np.ndarray, inverse: np.ndarray) -> tu
     c, A = exactly(xy, knots)
     smooth = np.abs(np.diff(c, axis=1)).max(axis=(1, 2)) < PROJECTED_EVERY * FASTEST_PX  # False for NaN
     weights = _cubic_weights((inverse - knots[0]) / (knots[1] - knots[0]), len(knots))
-    both = np.concatenate([c, A.reshape(m, -1, 4)], axis=2)
+    both = np.concatenate([c, A.reshape(m, len(knots), 4)], axis=2)
     found = np.einsum("dn,mnc->mdc", weights, np.where(smooth[:, None, None], both, 0.0), optimize=True)
     at, shape = found[..., :2], found[..., 2:].reshape(m, D, 2, 2)
     if not smooth.all():

@@ -54,8 +54,8 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
     if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         if not len(points.xyz_m):
             raise InputError(
-                f"Frame {points.frame} has no measured surface, and no outlines near the clicked joints; check the clicks and the rig, or "
-                "find outlines with `tricap contour`."
+                f"Frame {points.frame} has no measured surface, and no outlines near the clicked joints; check the clicks and the rig, "
+                "click in a frame that was measured, or find outlines with `tricap contour`."
             )
         raise InputError(
             f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
@@ -68,7 +68,7 @@ def _shaped(fit: FitContext, points: CloudPoints, found: Solution, vector: np.nd
     """The solution with its shape adjusted anew from a vector (S,), without outlines against the background, where the points suffice."""
     if not fit.background.known or not len(points.xyz_m):
         return found
-    again = _to_surface(fit.shaped_by(points), points, found.motion[0], vector, monitor)
+    again = _to_surface(fit.shaped(measured=True), points, found.motion[0], vector, monitor)
     least = fit.score(fit.click, points, found.motion[0], found.vector) * KEPT_SCORE
     return again if fit.score(fit.click, points, again.motion[0], again.vector) > least else found
 

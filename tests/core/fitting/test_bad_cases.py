@@ -194,7 +194,7 @@ def test_two_slight_steps_in_a_row_end_an_adjustment(monkeypatch, gains, damping
         return (now.motion + 0.1, now.vector, lin.cost - left.pop(0)), damping
 
     lin = SimpleNamespace(cost=1000.0, scales=lambda before: before)
-    monkeypatch.setattr("tricap.core.fitting.solve.solver.linearise", lambda problem, now: lin)
+    monkeypatch.setattr("tricap.core.fitting.solve.solver.linearise", lambda problem, now, given: lin)
     monkeypatch.setattr("tricap.core.fitting.solve.solver._accepted_step", step)
     problem = Problem(parameters=parameters, observe=lambda t, state: [])
     start = Estimate(motion=np.zeros((1, D)), vector=parameters.vector())

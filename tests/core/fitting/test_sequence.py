@@ -208,7 +208,7 @@ def test_bad_input_is_refused_in_a_sentence(make_scene) -> None:
         _fit(scene, joints={**scene.clicks, "wrist.R": {"X": (1.0, 2.0)}})
     with pytest.raises(InputError, match="frame 7"):
         _fit(scene, click=7)
-    with pytest.raises(InputError, match="no measured points"):
+    with pytest.raises(InputError, match="no measured surface"):
         _fit(scene, clouds=[_empty(0), scene.clouds[1]])
     with pytest.raises(InputError, match="no body model.*arm.R"):
         _fit(scene, model="arm.r")

@@ -34,6 +34,11 @@ def test_places_along_rays_are_those_of_their_projection(scenes: Any, base_m: fl
         assert (np.abs(at[far] - (w / 2, h / 2)) > w).any(axis=-1).all(), "nothing is seen where nothing is"
 
 
+def test_no_points_have_no_places(scenes: Any) -> None:
+    at, shape = seeds._along_rays(views_of(scenes), 0, np.zeros((0, 2)), np.linspace(0.1, 1.0, 50))
+    assert at.shape == (0, 50, 2) and shape.shape == (0, 50, 2, 2)
+
+
 def test_cubics_through_neighbours_are_exact_for_cubics() -> None:
     x, knots = np.linspace(0, 9, 57), np.arange(10.0)
     weights = seeds._cubic_weights(x, len(knots))
