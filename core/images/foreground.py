@@ -159,7 +159,9 @@ def given_background(grey: np.ndarray, images: Sequence[np.ndarray], cell_px: in
     if not noise:
         return None
     least = max(LEAST_NOISE, float(np.median(noise)))
-    return CellBackground(grey=grey, noise=least, sigma=np.full(grey.shape, least), known=np.ones(grey.shape), cell_px=cell_px)
+    shown = [image for image, q in zip(images, quartiles) if q <= OTHER_ROOM]
+    sigma = _sigma(shown, [np.zeros(grey.shape, dtype=bool)] * len(shown), grey, least)
+    return CellBackground(grey=grey, noise=least, sigma=sigma, known=np.ones(grey.shape), cell_px=cell_px)
 
 
 def person(background: CellBackground, image: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
