@@ -215,14 +215,10 @@ def _draw_colour_scale(run: RunResults, view: str, frame: int, red_mm: float, sh
     if found is None:
         return
     scale = bpy.context.preferences.system.ui_scale
-    width, height = 120 * scale, 10 * scale
-    x, y = sheet.region.width - width - 60 * scale, sheet.region.height - 60 * scale
-    canvas.fill(canvas.rectangle(x - 10 * scale, y - 20 * scale, width + 30 * scale, height + 28 * scale), canvas.BACKING)
-    for i in range(24):
-        colour = layers.heat_colours(np.array([(i + 0.5) / 24]))[0]
-        canvas.fill(canvas.rectangle(x + i * width / 24, y, width / 24 + 0.5, height), tuple(colour))
-    canvas.text("0", x, y - 15 * scale, size=11)
-    canvas.text(f"{found.red_mm:.2g} mm", x + width - 30 * scale, y - 15 * scale, size=11)
+    width = 120 * scale
+    x, y = sheet.region.width - width - 60 * scale, sheet.region.height - 80 * scale
+    shades = layers.heat_colours(np.linspace(0, 1, 24))[:, :3]
+    canvas.colour_bar(shades, ["0", f"{found.red_mm:.2g} mm"], "Sigma of the points", x, y, width)
 
 
 def _draw_legend(lines: list[tuple[str, Colour]], details: tuple[str, ...], sheet: Canvas) -> None:

@@ -18,7 +18,7 @@ from ..foundation.errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
-from ..geometry.view_angles import WIDEST_DEG, axis_angles_deg, is_alone
+from ..geometry.view_angles import WIDEST_DEG, axis_angles_deg, no_view_alike
 from ..take.take import Take
 from .findings import Cause, Checked, Finding, doubtful, wrong
 from .view_matches import PairMatches
@@ -83,7 +83,7 @@ def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
         f"The views that look most like the reference view {cameras[reference].name} are {nearest}. Texture can be matched up to about "
         f"{WIDEST_DEG:.0f}°, so "
     )
-    if is_alone(cameras, reference):
+    if no_view_alike(cameras, reference):
         sentence += "no surface is measured: the body is fitted to the person's outlines and clicked joints alone."
         return [doubtful(Cause.FAR_APART, sentence, "For a surface, place neighbouring cameras at most 30° apart.")]
     sentence += "hardly any surface will be measured."

@@ -14,7 +14,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..geometry.robust import finite_median
-from ..geometry.view_angles import is_alone
+from ..geometry.view_angles import no_view_alike
 from ..images.combing import Combing, combing
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
@@ -167,7 +167,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     clothes = Clothes.of(footage, matching)
     findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
     combed = film_combing(film) if footage.take.interlaced == "none" else None
-    matched = fitting.use_surface and not is_alone(footage.rig.cameras, footage.take.reference)
+    matched = fitting.use_surface and not no_view_alike(footage.rig.cameras, footage.take.reference)
     findings += [*combing_findings(combed), *(clothes.findings() if matched else []), *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),

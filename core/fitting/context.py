@@ -1,9 +1,8 @@
 """What stays the same throughout one fit: model, settings, clicks and priors, and how points become observations."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import cast
 
 import numpy as np
 
@@ -98,11 +97,7 @@ class FitContext:
         find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * gate_scale)
         if cache is None:
             return self._observed(points, state, *find())
-        owners = cache.get(points.frame, state, find)
-        earlier = cast(SurfacePoints | None, cache.derived(points.frame, owners))
-        observed = earlier.reweighted(state) if earlier is not None else self._observed(points, state, *owners)
-        cache.keep(points.frame, owners, observed)
-        return observed
+        return cache.observed(points.frame, state, find, partial(self._observed, points, state))
 
     def _observed(self, points: CloudPoints, state: BodyState, rows: np.ndarray, bone: np.ndarray, share: np.ndarray) -> SurfacePoints:
         """Some points (rows), each with its bone and the share of it that is this bone's."""
@@ -202,10 +197,9 @@ class FitContext:
             monitor=self.monitor,
         )
 
-    def shaped(self, measured: bool) -> "FitContext":
-        """The context of an adjustment of the shape: where points were measured, without outlines against the background, which are less
-        exact."""
-        return replace(self, silhouettes=self.silhouettes.drawn_only()) if measured else self
+    def with_exact_outlines(self, points: Iterable[CloudPoints]) -> "FitContext":
+        """Without the outlines against the background, which are less exact than measured points, if any of the frames has `points`."""
+        return replace(self, silhouettes=self.silhouettes.drawn_only()) if any(len(cloud.xyz_m) for cloud in points) else self
 
     def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """How many points and rays of frame index `t` a body explains: the sum of their robust weights for a width of `SUPPORT_SIGMA_M`."""

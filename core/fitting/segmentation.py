@@ -17,7 +17,7 @@ as the hard segmentation. The share of a limb where the surface is another part'
 """
 
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
@@ -61,12 +61,22 @@ def owners(rows: np.ndarray, bone: np.ndarray, gap: np.ndarray, own: np.ndarray)
     return rows[found], bone[found]
 
 
+class Reweighted(Protocol):
+    """Observations whose weights may be renewed."""
+
+    def reweighted(self, reference: BodyState) -> Self:
+        """The same with weights from another reference state."""
+
+
+R = TypeVar("R", bound=Reweighted)
+
+
 class SegmentationCache:
     """The limb of each point, as long as the body has hardly moved: points do not change limbs for a millimetre."""
 
     def __init__(self) -> None:
         self._found: dict[Hashable, tuple[np.ndarray, Any]] = {}
-        self._derived: dict[Hashable, tuple[Any, Any]] = {}
+        self._observed: dict[Hashable, tuple[Any, Any]] = {}
 
     def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
         """The segmentation for `key` of a body within `HYSTERESIS_M` of the present one; without one that of `find`."""
@@ -76,14 +86,13 @@ class SegmentationCache:
             self._found[key] = (now, find())
         return self._found[key][1]
 
-    def derived(self, key: Hashable, found: Any) -> Any:
-        """What was stored for `key` with this very segmentation; None if there is none."""
-        last = self._derived.get(key)
-        return last[1] if last is not None and last[0] is found else None
-
-    def keep(self, key: Hashable, found: Any, derived: Any) -> None:
-        """Store what was derived from a segmentation."""
-        self._derived[key] = found, derived
+    def observed(self, key: Hashable, state: BodyState, find: Callable[[], Any], observe: Callable[..., R]) -> R:
+        """The observations of the segmentation for `key`: with new weights as long as nothing changes its limb, else `observe`d anew."""
+        owners = self.get(key, state, find)
+        last = self._observed.get(key)
+        found = last[1].reweighted(state) if last is not None and last[0] is owners else observe(*owners)
+        self._observed[key] = owners, found
+        return cast(R, found)
 
 
 def crop(points: CloudPoints, state: BodyState, reach_m: np.ndarray | float) -> CloudPoints:

@@ -34,8 +34,8 @@ def neighbours_deg(cameras: Sequence[Camera], reference: int) -> np.ndarray:
     return np.sort(np.delete(axis_angles_deg(cameras, reference), reference))
 
 
-def is_alone(cameras: Sequence[Camera], reference: int) -> bool:
-    """Whether all other views look from too far apart from the reference view for patches to be matched: no surface can be measured."""
+def no_view_alike(cameras: Sequence[Camera], reference: int) -> bool:
+    """Whether no other view looks alike enough to be matched with the reference view: no surface can be measured."""
     return bool(neighbours_deg(cameras, reference)[0] > WIDEST_DEG)
 
 

@@ -38,7 +38,7 @@ from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, of_model, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..geometry.view_angles import is_alone
+from ..geometry.view_angles import no_view_alike
 from ..matching.foreground import Foreground
 from ..motion.formats.ply import write_mesh
 from ..motion.tables import write_joints, write_motion
@@ -81,7 +81,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         Cancelled: the frames measured so far are kept.
     """
     cameras, reference = run.footage.rig.cameras, run.footage.take.reference
-    if is_alone(cameras, reference) and not missing_for_fit(run.footage):
+    if no_view_alike(cameras, reference) and not missing_for_fit(run.footage):
         run.warn(*(finding.sentence for finding in wide_findings(cameras, reference)))
         return run.do_without_surface("the views look from too far apart")
     began, summaries, kept, frames = time.perf_counter(), list[FrameSummary](), set[int](), run.footage.frames

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..foundation.progress import Monitor
-from ..geometry.view_angles import WIDEST_DEG, is_alone, neighbours_deg
+from ..geometry.view_angles import WIDEST_DEG, neighbours_deg, no_view_alike
 from ..results.folder import Results
 from ..take.footage import Footage
 from .measure import NothingMeasured, measure_frames
@@ -44,7 +44,7 @@ def other_beginning(footage: Footage, settings: MeasureSettings, results: Result
         InputError: the images cannot be read.
         Cancelled: the user asked to stop.
     """
-    if is_alone(footage.rig.cameras, footage.take.reference):
+    if no_view_alike(footage.rig.cameras, footage.take.reference):
         return None
     first, degrees = first_frame(footage), neighbours_deg(footage.rig.cameras, footage.take.reference)
     frames = _others(footage, settings, first)

@@ -10,7 +10,7 @@ other way than the limb.
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import cast
+from functools import partial
 
 import cv2
 import numpy as np
@@ -149,22 +149,16 @@ class Silhouettes:
         def find() -> tuple[np.ndarray, np.ndarray]:
             return touched(rays, state, self._surface, self._settings.outline_gate_m * gate_scale)
 
-        if cache is None:
-            return self._observed(rays, state, *find())
-        owners = cache.get(("rays", t), state, find)
-        earlier = cast(list[SilhouetteRays] | None, cache.derived(("rays", t), owners))
-        observed = [one.reweighted(state) for one in earlier] if earlier is not None else self._observed(rays, state, *owners)
-        cache.keep(("rays", t), owners, observed)
-        return observed
+        observe = partial(self._observed, rays, state)
+        found = observe(*find()) if cache is None else cache.observed(("rays", t), state, find, observe)
+        return [found] if found.size else []
 
-    def _observed(self, rays: Rays, state: BodyState, rows: np.ndarray, bone: np.ndarray) -> list[SilhouetteRays]:
+    def _observed(self, rays: Rays, state: BodyState, rows: np.ndarray, bone: np.ndarray) -> SilhouetteRays:
         """Some rays (rows), each with the bone that it touches."""
-        if not len(rows):
-            return []
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
         own, model = (rays.angle[rows] * away) ** 2 + VARIANCE_FLOOR_M2, rays.model_m[rows] ** 2
         in_patch = np.maximum(1.0, rays.patch[rows] * self._settings.model_patch_m)
-        found = SilhouetteRays.about(
+        return SilhouetteRays.about(
             state,
             origin_m=rays.origin_m[rows],
             direction=rays.direction[rows],
@@ -172,7 +166,6 @@ class Silhouettes:
             sigma_m=np.sqrt(own + model),
             variance_inflation=(own + in_patch * model) / (own + model),
         )
-        return [found]
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
         ahead = np.array([view.camera.R_cam_world[2] for view in self._views]).reshape(-1, 3)

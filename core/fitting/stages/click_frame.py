@@ -68,7 +68,7 @@ def _shaped(fit: FitContext, points: CloudPoints, found: Solution, vector: np.nd
     """The solution with its shape adjusted anew from a vector (S,), without outlines against the background, where the points suffice."""
     if not fit.background.known or not len(points.xyz_m):
         return found
-    again = _to_surface(fit.shaped(measured=True), points, found.motion[0], vector, monitor)
+    again = _to_surface(fit.with_exact_outlines([points]), points, found.motion[0], vector, monitor)
     least = fit.score(fit.click, points, found.motion[0], found.vector) * KEPT_SCORE
     return again if fit.score(fit.click, points, again.motion[0], again.vector) > least else found
 

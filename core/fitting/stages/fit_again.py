@@ -124,7 +124,7 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         tracks=JointTracks(given, names),
     )
     points = [thinned(cloud, settings.voxel_m) for cloud in given.clouds]
-    fit = replace(fit, monitor=monitor).shaped(any(len(cloud.xyz_m) for cloud in points))
+    fit = replace(fit, monitor=monitor).with_exact_outlines(points)
     observed = np.ones(earlier.values.shape, dtype=bool)
     tracked = settings.use_trajectories and given.trajectories is not None
     whole = Recording(

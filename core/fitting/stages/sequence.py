@@ -151,7 +151,7 @@ def _adjusted_body(
     """Step 4 and those after it."""
     fit, points, first, motion = tracking.fit, tracking.points, tracking.first, start.motion
     settings = replace(fit.settings, model_patch_m=PATCH * fit.settings.model_patch_m)
-    fit = replace(fit.shaped(any(len(cloud.xyz_m) for cloud in points)), settings=settings)
+    fit = replace(fit.with_exact_outlines(points), settings=settings)
     whole = Recording(
         fit=fit,
         frames=given.frames,

@@ -17,7 +17,7 @@ from tricap.core.cli import main
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
-from tricap.core.geometry.view_angles import is_alone
+from tricap.core.geometry.view_angles import no_view_alike
 from tricap.core.motion.formats.ply import read_ply, write_cloud
 from tricap.core.motion.tables import read_joints
 from tricap.core.run import pipeline
@@ -241,5 +241,5 @@ def test_views_from_too_far_apart_are_found():
     (found,) = wide_findings(turned(60), 1)
     assert found.cause == Cause.FAR_APART and "(60°)" in found.sentence and "hardly any surface" in found.sentence
     (found,) = wide_findings([turned(60)[2], CAMERAS[1]], 1)
-    assert "no surface is measured" in found.sentence and is_alone([turned(60)[2], CAMERAS[1]], 1) and not is_alone(turned(60), 1)
+    assert "no surface is measured" in found.sentence and no_view_alike([turned(60)[2], CAMERAS[1]], 1) and not no_view_alike(turned(60), 1)
     assert not wide_findings([*turned(60), CAMERAS[0]], 1)  # two others are near enough
