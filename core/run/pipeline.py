@@ -400,10 +400,13 @@ def _known_poses(body: BodyFit, most: int) -> list[int]:
 
 def _surface_points(run: Run, body: BodyFit) -> list[SurfacePoints]:
     """What was measured in frames whose pose is known."""
-    found = []
+    found, patch_px = [], run.settings["matching"].patch_px
+    camera = run.measured_footage.rig.cameras[run.footage.take.reference]
     for row in _known_poses(body, MOST_FRAMES):
         cloud = run.clouds[row]
         if len(cloud.xyz_m):
             sigma = np.sqrt(np.einsum("ni,nij,nj->n", cloud.normals, cloud.covariance_m2, cloud.normals))
-            found.append(SurfacePoints(motion=body.motion.values[row], xyz_m=cloud.xyz_m, normals=cloud.normals, sigma_m=sigma))
+            patch_m = patch_px * float(np.median(camera.to_camera(cloud.xyz_m)[:, 2])) / camera.focal_px
+            points = SurfacePoints(motion=body.motion.values[row], xyz_m=cloud.xyz_m, normals=cloud.normals, sigma_m=sigma, patch_m=patch_m)
+            found.append(points)
     return found

@@ -13,7 +13,8 @@ displacement δ of the vertex, which has a Gaussian Markov prior of the Matérn 
     σ² = σ_d² + c² σ_f² ,   σ_f: mean absolute deviation of the frames' d from δ nearby, √(π/2) times        (3)
 
 At head, hands and feet, whose shapes are anatomical, s is smaller and n is the normal of the surface without nose, ears and toes: along
-their own normals a coarse measurement would fold them.
+their own normals a coarse measurement would fold them. A patch shows a surface that is smoother than a nose, and there points are compared
+with the skin smoothed alike, so that a nose is not flattened by its own measurement.
 
 c > 1, because the errors of a frame are alike in all points of a region, so that many points of few frames prove little. Thus the skin is
 detailed where the frames agree (a face), and smooth where they do not (a bending hip).
@@ -56,6 +57,7 @@ LEAST_SIGMA_M = 0.0005  # of an observation: the surface's texture
 START_SIGMA_M = 0.004  # σ_f at first
 CORRELATED = 3.0  # c of (3)
 NEARBY_M = 0.03  # over which σ_f is averaged
+BLUR = 0.14  # of a patch's side: the length over which it smooths the surface
 MOST_FRAMES = 80  # evenly over the take
 ROUNDS = (12, MOST_FRAMES)  # frames, evenly, of each round of finding the points' vertices
 TOGETHER = 8  # frames between two reports of progress
@@ -74,6 +76,7 @@ class SurfacePoints:
     xyz_m: np.ndarray  # (N, 3)
     normals: np.ndarray  # (N, 3)
     sigma_m: np.ndarray  # (N,)
+    patch_m: float = 0.0  # side of the patches that were matched
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -109,13 +112,13 @@ def measured_relief(
         Cancelled: the monitor was cancelled.
     """
     poser, nearby = Poser(shape, skin.weights), Nearby(skin.vertices_m, skin.faces)
-    normals = directions(skin, shape, nearby)
+    normals, as_measured = directions(skin, shape, nearby), _blurred(skin, shape, BLUR * float(np.median([f.patch_m for f in frames])))
     size, fingers = _prior_sigma(shape, skin), _fingers(shape, skin)
     gate = np.where(fingers < 0.5, GATE * np.maximum(size, PRIOR_M * _share(shape, skin, (HEAD,))), 0.0)
     prior, delta, factor, weight = _prior(skin.vertices_m, skin.faces, size), np.zeros(len(normals)), None, np.zeros(0)
     smoothed = anatomical(shape, skin.weights)
     for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
-        moved, found = skin.vertices_m + delta[:, None] * normals, list[_Observed]()
+        moved, found = as_measured + delta[:, None] * normals, list[_Observed]()
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
         observed = partial(_observed, poser, moved, skin.faces, delta, gate, normals, smoothed)
         for i in range(0, len(chosen), TOGETHER):
@@ -135,13 +138,13 @@ def measured_relief(
 
 
 class Nearby:
-    """Means over the neighbourhood of every vertex, by diffusion."""
+    """Means over the neighbourhood of every vertex, by diffusion over a length [m]."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, length_m: float = NEARBY_M) -> None:
         from scipy import sparse
 
         C, area = laplacian(vertices, faces)
-        self._factor, self._count, self._area = factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area), area
+        self._factor, self._count, self._area = factorised(sparse.diags(area) - length_m**2 * C), len(area), area
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Smooth values (V, K)."""
@@ -160,6 +163,14 @@ def directions(skin: OneSkin, shape: BodyShape, nearby: Nearby | None = None) ->
     normals = vertex_normals(skin.vertices_m, skin.faces)
     smooth = (nearby or Nearby(skin.vertices_m, skin.faces)).mean(normals)
     return _mixed(normals, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), anatomical(shape, skin.weights))
+
+
+def _blurred(skin: OneSkin, shape: BodyShape, length_m: float) -> np.ndarray:
+    """Vertices (V, 3) of a skin whose anatomical parts are smoothed over a length."""
+    if length_m == 0:
+        return skin.vertices_m
+    smooth = Nearby(skin.vertices_m, skin.faces, length_m).mean(skin.vertices_m)
+    return np.asarray(skin.vertices_m + anatomical(shape, skin.weights)[:, None] * (smooth - skin.vertices_m))
 
 
 def _mixed(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -16,8 +16,9 @@ from tricap.core.body.skin.head_place import LEVEL, MOST_TURN, registered_head
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.person_skin import rest_skin
 from tricap.core.body.skin.posed import Poser
-from tricap.core.body.skin.relief import SurfacePoints
+from tricap.core.body.skin.relief import Nearby, SurfacePoints, measured_relief
 from tricap.core.body.skin.surface_operators import vertex_normals
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import rotation_from_vector, vector_from_rotation
 
 TURN = np.radians([-15.0, 9.0, 4.0])
@@ -128,3 +129,16 @@ def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
     assert registered_head(skin, shape, few) is None
     aside = np.array([-0.4, 1.3 * MOST_TURN, 0.0])  # further than a fit is wrong
     assert registered_head(skin, shape, _points(shape, skin, aside)).face_turn is None
+
+
+@pytest.mark.slow
+def test_a_face_is_not_flattened_by_patches_that_smooth_it(person) -> None:
+    shape, skin = person
+    smooth = replace(skin, vertices_m=Nearby(skin.vertices_m, skin.faces, 0.007).mean(skin.vertices_m))
+    seen = _points(shape, smooth, np.zeros(3))[:4]
+    exact, as_patches = (
+        np.abs(measured_relief(skin, shape, [replace(p, patch_m=side) for p in seen], False, Monitor()).displacement_m)
+        for side in (0.0, 0.05)
+    )
+    face = exact > np.quantile(exact, 0.99)  # nose, mouth and ears
+    assert exact[face].min() > 0.003 and np.median(as_patches[face]) < 0.0005
