@@ -24,14 +24,14 @@ ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
 
 
 def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
-    """Captions and pictures from a trajectories_raw.npz: all, removed, kept; none where the file is missing or empty."""
+    """Captions and pictures from a trajectories_raw.npz: all, removed, kept; none where the file is missing, empty, or of one frame."""
     if not path.is_file():
         return []
     arrays = store.load(path)[0]
     xyz, status = arrays["xyz_m"].astype(np.float64), arrays["status"]
     seen = np.isfinite(xyz).all(axis=2)
     columns = np.flatnonzero(seen.any(axis=0))
-    if not len(columns):
+    if not len(columns) or len(xyz) < 2:
         return []
     every = max(1, -(-int(seen.sum()) // MOST_PLACES))
     columns = columns[::every]
