@@ -1,4 +1,4 @@
-"""The table of docs/method.md that goes through the two papers: every row is there, and names what exists."""
+"""The tables of docs/method.md that go through the two papers: every sentence and figure is there, and names what exists."""
 
 import argparse
 import ast
@@ -11,6 +11,7 @@ import pytest
 from tricap.addon import command
 from tricap.addon.retarget import command as retargeting
 from tricap.core.cli.parser import build_parser
+from tricap.core.report.pages import KINDS
 from tricap.core.run.settings import SETTINGS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,7 +26,8 @@ def rows(text: str) -> dict[str, tuple[str, str]]:
     return {row[0].strip("| "): (row[2], row[3]) for row in cells}
 
 
-TABLE = rows((ROOT / "docs" / "method.md").read_text(encoding="utf-8"))
+TEXT = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+TABLE = rows(TEXT)
 
 
 @cache
@@ -71,6 +73,20 @@ def test_every_sentence_of_the_papers_has_a_row() -> None:
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_row_names_what_exists(number: str) -> None:
     assert not faults(*TABLE[number])
+
+
+def test_every_figure_of_the_papers_has_a_place() -> None:
+    """Each figure once (the text of B has none with the number 15); commands, settings, buttons and sections of the report exist."""
+    lines = [line.strip("| ").split(" | ") for line in TEXT.splitlines() if re.match(r"\| [AB] \d", line)]
+    figures = [figure for numbers, _, _ in lines for figure in numbers.split(", ")]
+    assert sorted(figures) == sorted([*(f"A {n}" for n in range(1, 15)), *(f"B {n}" for n in range(1, 18) if n != 15)])
+    sections = {*KINDS, "Cameras and person"}
+    for _, _, here in lines:
+        named = re.findall(r"\*\*([^*]+)\*\*", here)
+        assert set(named) <= sections, here
+        chapters = re.findall(r"\*([^*]+)\*", here) if here.endswith(" above") else []
+        assert all(f"## {chapter}" in TEXT for chapter in chapters)
+        assert chapters or not [fault for fault in faults(re.sub(r"\*\*[^*]+\*\*", "", here), "") if fault]
 
 
 def test_what_does_not_exist_is_found() -> None:

@@ -17,6 +17,7 @@ HIGHER, LOWER, NEITHER = "higher", "lower", ""  # which values of a measure are 
 LEAST = 0.001  # smaller values are not written out
 EQUAL = 0.02  # relative difference below which neither method is better
 KINDS = {  # of pictures, and their captions
+    "patches": "least squares matching of one point, at the start (black) and as found (white)",
     "surface": "measured points, coloured by their sigma",
     "cloud": "the cloud from the front and from the right side",
     "tracks": "the paths of the points over the last frames, coloured by speed",

@@ -10,17 +10,19 @@ STYLE = """
 @media (prefers-color-scheme:dark){:root{--paper:#1b1d20;--ink:#e4e4e4;--soft:#a0a0a0;--line:#3c4046;--note:#4a3f1c;--box:#26292d;
 --good:#58d68d;--bad:#ec7063}}
 *{box-sizing:border-box}body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:0 auto;padding:1em;color:var(--ink);
-background:var(--paper)}h1{margin:.2em 0}h2{margin:1.6em 0 .5em}img,svg{max-width:100%;height:auto}
+background:var(--paper);overflow-wrap:anywhere}h1{margin:.2em 0}h2{margin:1.6em 0 .5em}img,svg{max-width:100%;height:auto}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{display:grid;gap:1em;
 grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.cells{gap:.4em;
 grid-template-columns:repeat(auto-fill,minmax(min(30%,120px),1fr))}.graphs{
 grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}.wide{overflow-x:auto}
 .single{grid-template-columns:1fr}.broad{grid-template-columns:repeat(auto-fill,minmax(min(100%,440px),1fr))}
-figure img{width:100%}.strip{display:grid;grid-template-columns:max-content 1fr;gap:4px .8em;font-size:13px;line-height:18px}
+figure img{width:100%}.strip{display:grid;grid-template-columns:max-content minmax(0,1fr);gap:4px .8em;font-size:13px;line-height:18px}
 .strip>span{text-align:right}.strip svg{width:100%;height:18px}.strip div{display:flex;justify-content:space-between}
-.strip div:last-child{justify-content:flex-start;align-items:flex-end;gap:.4em}
-.strip i{width:22px;print-color-adjust:exact}.strip i:not(:first-child){margin-left:1em}
-table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
+.strip div:last-child{flex-wrap:wrap;justify-content:flex-start;gap:0 1em}
+.strip div:last-child span{display:flex;align-items:flex-end;gap:.4em}
+.strip i{width:22px;print-color-adjust:exact}
+table{border-collapse:collapse;overflow-wrap:normal}
+td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
 .note{background:var(--note);padding:.4em .8em;margin:.4em 0}.soft{color:var(--soft)}.good{color:var(--good)}.bad{color:var(--bad)}
 .first{display:grid;gap:1em;grid-template-columns:repeat(auto-fit,minmax(min(100%,380px),1fr));margin:1em 0}.stage[hidden]{display:none}
 .stage img{display:block;width:100%;max-height:520px;object-fit:contain;object-position:left}.stage output{font-size:13px}
@@ -30,6 +32,7 @@ table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;bo
 .row figure.large{grid-column:1/-1}figure.large img{cursor:zoom-out}
 .verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;
 overflow-wrap:anywhere;background:var(--box);padding:.6em}svg{color:var(--ink);background:none}
+@media screen and (max-width:700px){.single figure{overflow-x:auto}.single img{width:auto;max-width:none;height:340px}}
 @media print{:root{--paper:#fff;--ink:#000;--soft:#444;--line:#bbb;--note:#eee;--box:#f5f5f5}body{max-width:none;font-size:11pt}
 .row:not(.single,.broad,.cells){grid-template-columns:repeat(3,1fr)}.row.graphs{grid-template-columns:1fr 1fr}h2,summary{break-after:avoid}
 figure,svg,tr{break-inside:avoid}.stage,nav{display:none}.now{visibility:hidden}}

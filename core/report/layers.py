@@ -15,12 +15,13 @@ from .drawing import add_axes, add_scale, small_text
 from .person import Coloured, Mesh
 
 PANEL_PX = (330, 520)  # width, height
-GROUND, EDGE = (28, 28, 28), (90, 90, 90)
+GROUND, EDGE = (28, 28, 28), (125, 125, 125)
 BONE_LINE, JOINT_DOT = (200, 215, 225), (60, 190, 250)
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
 KIND_COLOURS = {BONE: (205, 225, 235), MUSCLE: (85, 85, 215), FAT: (90, 205, 240), FLESH: (120, 140, 220)}  # BGR
 DISTANCE_M, MARGIN_M = 30.0, 0.16  # far away, so that the picture is nearly to one scale
 TITLES = ("a  skeleton", "b  metaballs", "c  blended surface", "d  finished skin", "e  with its texture")
+LETTERS = 1.7  # their size: the page shows five panels in the width of one
 FACTOR, DARKEST = 2, 0.55  # samples across a pixel of the last panel, and its least light: the texture has shades of its own
 
 
@@ -32,9 +33,9 @@ def layers_picture(shape: BodyShape, skin: Skin, finished: Mesh, coloured: Colou
     panels = [_skeleton(shape, rest, camera), _balls(shape, rest, camera), _polygons(skin, camera), _shaded(finished, camera)]
     panels += [_textured(coloured, camera)] if coloured is not None else []
     for panel, title in zip(panels, TITLES):
-        small_text(panel, title, (10, 20))
-        add_scale(panel, px_per_m)
-        add_axes(panel, ("x", "z"), up=True)
+        small_text(panel, title, (10, 24), size=LETTERS)
+        add_scale(panel, px_per_m, size=LETTERS)
+        add_axes(panel, ("x", "z"), up=True, size=LETTERS)
     return np.hstack(panels)
 
 

@@ -27,7 +27,9 @@ def limb_strip(frames: Sequence[int], words: Mapping[str, Sequence[str]]) -> str
             f'xmlns="http://www.w3.org/2000/svg" aria-label="{html.escape(limb)} over the frames">{bars}{now}</svg>'
         )
     ends = f"<span></span><div><span>frame {first}</span><span>{frames[-1]}</span></div>"
-    meaning = "".join(f'<i style="height:{BAR * share:.0f}px;background:{colour}"></i>{word}' for word, (colour, share) in STYLES.items())
+    meaning = "".join(
+        f'<span><i style="height:{BAR * share:.0f}px;background:{colour}"></i>{word}</span>' for word, (colour, share) in STYLES.items()
+    )
     return f'<div class="strip">{"".join(rows)}{ends}<span></span><div>{meaning}</div></div>'
 
 

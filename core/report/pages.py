@@ -36,6 +36,7 @@ from .layers import kinds_shown, layers_picture
 from .limb_strip import MEANING, limb_strip
 from .loop_pictures import loop_words, outline_pictures
 from .overview import WHY, about_joints, body_by_sigma, bone_sigma_mm, headline, verdict
+from .patch_picture import MatchedPatch, patch_picture
 from .person import SkinAt, coloured_skin, skin_in
 from .silhouettes import Silhouettes
 from .trails import VECTORS, longest_vectors, trail_pictures, vector_pictures
@@ -43,13 +44,14 @@ from .trails import VECTORS, longest_vectors, trail_pictures, vector_pictures
 LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
 LOOP = "The closed loop"
 KINDS = {  # of pictures
-    "Measured surface": ("surface", "cloud"),
+    "Measured surface": ("patches", "surface", "cloud"),
     "Trajectories": ("tracks", "vectors", "trails"),
     "Body over the footage": ("body",),
     LOOP: ("outlines",),
     "Layers of the body": ("layers",),
 }
 BROAD = ("vectors",)  # two pictures of two panels
+SINGLE = ("patches", "layers")  # one picture of several panels
 DOT = 0.3  # radius of a measured point in a picture, by the distance of neighbouring points
 AXES = "Axes of the camera: x to the right, y down, z away from it. Scales are those at the person's distance."
 REST_AXES = "Axes: x to the person's left, z up."
@@ -87,6 +89,7 @@ class Report:
     silhouettes: Silhouettes
     doubtful: Mapping[int, str] = field(default_factory=dict)  # frame -> why, the worst first
     close_ups: bool = True  # pictures show the person as large as they can; otherwise whole images, for pages beside each other
+    patch: MatchedPatch | None = None  # an example of matching
     colour_limits: Mapping[str, float] = field(default_factory=dict)  # upper ends of bars of colours, by picture; the others are its own
 
 
@@ -111,6 +114,9 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
         shown |= {f"vectors_{name}.png": picture for name, picture in vectors.items()}
     if loop_words(record["stages"]):
         shown |= outline_pictures(results, report.footage, report.trajectories, report.close_ups)
+    if (patch := report.patch) is not None:
+        names = [view.name for view in report.footage.take.views]
+        shown[f"patches_{patch.frame:04d}.png"] = patch_picture(patch, report.footage.read_whole(patch.frame), names)
     shown |= _layers(report, results.path("skin"), skin_at)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
@@ -170,7 +176,7 @@ def _pictures(
         )
         from_sides = pictures.cloud_views(cloud, camera, spacing)
         found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the front and from its right side", from_sides)
-        if trajectories is not None:
+        if trajectories is not None and trajectories.visible.any():
             caption = f"Frame {frame}, view {view}: the paths of the points over the last {pictures.TAIL_FRAMES} frames, coloured by speed"
             name = f"tracks_{frame:04d}.png"
             fast = limits.get(name, float("nan"))
@@ -378,7 +384,7 @@ def _all_figures(record: Mapping[str, Any], rows: Sequence[Row]) -> str:
 
 def _picture_row(kind: str, figures: Sequence[str]) -> str:
     """Figures beside each other; those that have several panels are wider."""
-    width = "single" if kind == "layers" else "broad" if kind in BROAD or len(figures) < 3 else ""
+    width = "single" if kind in SINGLE else "broad" if kind in BROAD or len(figures) < 3 else ""
     return f'<div class="row {width}">{"".join(figures)}</div>'
 
 

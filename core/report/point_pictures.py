@@ -14,6 +14,7 @@ from .trails import both_views, framed, limits_of
 
 COLOURS = ((80, 80, 240), (230, 150, 40), (90, 200, 90), (40, 190, 250), (220, 110, 200), (200, 200, 60))  # BGR, in turns
 JOINING = (235, 235, 235)  # of lines between points
+NAME_SIZE = 1.3  # of letters, in space
 
 
 def paths_over_footage(
@@ -37,10 +38,7 @@ def paths_over_footage(
         if np.isfinite(path[-1]).all():
             x, y = np.rint(path[-1]).astype(int).tolist()
             cv2.drawMarker(picture, (x, y), tint, cv2.MARKER_CROSS, round(11 * k), max(1, round(k)), cv2.LINE_AA)
-            right = x + round(7 * k)
-            wide = text_width(plain(name), k)
-            at = right if right + wide < picture.shape[1] else max(0, x - round(7 * k) - wide)
-            small_text(picture, plain(name), (at, y - round(5 * k)), tint)
+            _write_name(picture, name, path, tint, k)
     return picture
 
 
@@ -55,7 +53,16 @@ def paths_in_space(names: tuple[str, ...], tracked: KeyPoints, camera: Camera) -
     pair = both_views(place, seen, np.broadcast_to(tints, place.shape), limits)
     for picture, axes, sign in zip(pair, ([0, 1], [2, 1]), (1, -1)):
         for n in np.flatnonzero(seen.any(axis=0)):
-            last = place[np.flatnonzero(seen[:, n])[-1], n][axes] - middle[axes]
-            x, y = np.rint(picture.shape[0] / 2 * (1 + last * [sign, 1] / half)).astype(int).tolist()
-            small_text(picture, plain(names[n]), (x + 4, y - 4), COLOURS[n % len(COLOURS)], size=1.0)
+            path = picture.shape[0] / 2 * (1 + (place[seen[:, n], n][:, axes] - middle[axes]) * [sign, 1] / half)
+            _write_name(picture, names[n], path, COLOURS[n % len(COLOURS)], NAME_SIZE)
     return framed(pair, half)
+
+
+def _write_name(picture: np.ndarray, name: str, path: np.ndarray, tint: tuple[int, int, int], size: float) -> None:
+    """A name at the end of its path (M, 2), on the side from which the path does not come, or where there is room."""
+    x, y = np.rint(path[-1]).astype(int).tolist()
+    gap, wide = round(7 * size), text_width(plain(name), size)
+    right, left = x + gap, x - gap - wide
+    ahead = float(np.nanmean(path[:, 0])) > x  # it comes from the right
+    at = left if (ahead and left >= 0) or right + wide >= picture.shape[1] else right
+    small_text(picture, plain(name), (max(0, at), y - round(5 * size)), tint, size)

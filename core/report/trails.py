@@ -24,14 +24,14 @@ ALL_COLOUR, KEPT_COLOUR = (190, 190, 190), (120, 200, 90)  # BGR
 
 
 def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
-    """Captions and pictures from a trajectories_raw.npz: all, removed, kept; none where the file is missing or empty."""
+    """Captions and pictures from a trajectories_raw.npz: all, removed, kept; none where the file is missing, empty, or of one frame."""
     if not path.is_file():
         return []
     arrays = store.load(path)[0]
     xyz, status = arrays["xyz_m"].astype(np.float64), arrays["status"]
     seen = np.isfinite(xyz).all(axis=2)
     columns = np.flatnonzero(seen.any(axis=0))
-    if not len(columns):
+    if not len(columns) or len(xyz) < 2:
         return []
     every = max(1, -(-int(seen.sum()) // MOST_PLACES))
     columns = columns[::every]
@@ -87,7 +87,7 @@ def vector_pictures(
         pair = [_arrows(place[rows], arrows, size / high, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
         words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
-        shown = framed(pair, limits[1], (high, f"{name}, {unit.replace('²', '^2')}"), 1.0)
+        shown = framed(pair, limits[1], (high, f"{name}, {unit.replace('²', '^2')}"))
         found[key] = (f"{words}; red and longest: {high:.2g} {unit} or more", shown)
     return found
 
@@ -126,11 +126,13 @@ def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits
     return pair
 
 
-def framed(pair: Sequence[np.ndarray], half_m: float, bar: tuple[float, str] | None = None, size: float = OF_PANELS) -> np.ndarray:
-    """Both views beside each other with their names, scales and axes; the first with the bar of colours."""
-    scale, panels = pair[0].shape[0] / 2 / half_m, []
+def framed(pair: Sequence[np.ndarray], half_m: float, bar: tuple[float, str] | None = None) -> np.ndarray:
+    """Both views beside each other with their names, scales and axes; the first with the bar of colours instead of the scale, which is the
+    same in both."""
+    px_per_m, panels, k = pair[0].shape[0] / 2 / half_m, [], OF_PANELS
     for picture, words, axes, own in zip(pair, (FRONT, SIDE), (("x", "y"), ("z", "y")), (bar, None)):
-        panels.append(with_title(with_strip(picture, scale, axes, left=axes[0] == "z", bar=own, size=size), words, size))
+        scale = px_per_m if own is None else float("nan")
+        panels.append(with_title(with_strip(picture, scale, axes, left=axes[0] == "z", bar=own, size=k), words, k))
     return np.hstack(panels)
 
 

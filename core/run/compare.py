@@ -1,13 +1,14 @@
 """`tricap compare`: one take with the published and with the default method, and the same measures of both side by side.
 
 Each method is a run of its own, in DIR/published and DIR/default, and resumes as any run does. The default runs first: of a take without
-clicks it finds the joints, from which the published method then begins. The measures are computed from the files that both wrote, not from
-what a method reports about itself, except for times and sigmas. The colours of both reports have common scales.
+clicks it finds the joints, or points all over the surface where there is no body, from which the published method then begins. The measures
+are computed from the files that both wrote, not from what a method reports about itself, except for times and sigmas. The colours of both
+reports have common scales.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,11 @@ from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median, mad_sigma
+from ..geometry.view_angles import views_alike
 from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page, written
 from ..results.folder import Results, check_inside, check_separate_folder
-from ..take.take import Take
+from ..take.take import Clicks, FrameClicks, Take
 from . import pipeline
 from .joints import pixels_of, with_joints
 from .settings import Overrides
@@ -30,6 +32,7 @@ from .take_run import Run, open_run
 
 PLACE_M = 0.02  # edge of the cubes in which coverage is counted
 SURFACE, TRACKS, BODY, TIME = "Surface", "Trajectories", "Body", "Time"  # groups of measures
+CLICKED_POINTS = 6  # of the surface, where nobody clicked any: a person clicks few
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 
@@ -44,7 +47,7 @@ class Halves:
 def run_both(
     take: Path, out: Path, overrides: Overrides, frames: tuple[int, int] | None, monitor: Monitor, *, restart: bool = False
 ) -> Halves:
-    """Run the default and then the published method. Joints that the default found without clicks are clicks for the published one.
+    """Run the default and then the published method. What the default found without clicks are clicks for the published one.
 
     Raises:
         InputError: see `pipeline.run`, of the default method; or the overrides choose a preset, or one of the folders is a link out of
@@ -64,7 +67,7 @@ def run_both(
         both.callback(_remove_empty, out / PUBLISHED)
         default = both.enter_context(opened(DEFAULT))
         _complete(default, DEFAULT, monitor)
-        clicked, note = _found_joints(default)
+        clicked, note = _stand_in_clicks(default)
         try:
             published = both.enter_context(opened(PUBLISHED, clicked))
             published.pictured = _pictured(out / DEFAULT)
@@ -95,17 +98,46 @@ def _pictured(folder: Path) -> list[int]:
     return sorted(int(path.stem.rpartition("_")[2]) for path in (folder / "report").glob("cloud_*.png"))
 
 
-def _found_joints(run: Run) -> tuple[Callable[[Take], Take] | None, tuple[str, ...]]:
-    """Whatever a run found without clicks as clicks, with a sentence about it; nothing if the take's own clicks were enough."""
-    start = run.record["stages"].get("fit", {}).get("start")
-    if start is None:
+def _stand_in_clicks(run: Run) -> tuple[Callable[[Take], Take] | None, tuple[str, ...]]:
+    """What a run found without clicks as clicks, joints or else points of the surface, with a sentence about it; nothing if the take's own
+    clicks were enough."""
+    start, take = run.record["stages"].get("fit", {}).get("start"), run.footage.take
+    if start is not None:
+        joints = pixels_of(run.footage, {name: np.array(xyz) for name, xyz in start["joints_m"].items()}, start["unsure"])
+        note = (
+            f"The take has not enough clicks for the published method: it began from {len(joints)} joints that the default method found in "
+            f"frame {start['frame']}, as if they had been clicked."
+        )
+        return partial(with_joints, frame=start["frame"], joints=joints), (note,)
+    if take.clicks.named or take.keyframes:
         return None, ()
-    joints = pixels_of(run.footage, {name: np.array(xyz) for name, xyz in start["joints_m"].items()}, start["unsure"])
+    frame, surface = _spread_points(run)
     note = (
-        f"The take has not enough clicks for the published method: it began from {len(joints)} joints that the default method found in "
-        f"frame {start['frame']}, as if they had been clicked."
+        f"The take has no clicks for the published method: it began from {len(surface)} points that the default method measured in frame "
+        f"{frame}, as if they had been clicked."
     )
-    return partial(with_joints, frame=start["frame"], joints=joints), (note,)
+    return (partial(_with_surface, clicks=FrameClicks(frame=frame, surface=surface)), (note,)) if surface else (None, ())
+
+
+def _with_surface(take: Take, clicks: FrameClicks) -> Take:
+    return replace(take, clicks=clicks)
+
+
+def _spread_points(run: Run) -> tuple[int, tuple[Clicks, ...]]:
+    """The first frame with measured points, and a few of its good ones, far from each other, in the views that are matched."""
+    rig, reference = run.footage.rig, run.footage.take.reference
+    cameras = [rig.cameras[k] for k in (reference, *views_alike(rig.cameras, reference))]
+    for path in sorted((run.results.folder / "clouds").glob("*.ply")):
+        cloud = read_ply(path)
+        xyz = cloud.xyz_m[cloud.vertex["sigma"] <= np.median(cloud.vertex["sigma"])] if len(cloud.xyz_m) else cloud.xyz_m
+        xyz = xyz[np.all([camera.sees(camera.project(xyz)) for camera in cameras], axis=0)]
+        if len(xyz):
+            xy = cameras[0].project(xyz)
+            chosen = [int(np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))]
+            while len(chosen) < min(CLICKED_POINTS, len(xyz)):
+                chosen.append(int(np.argmax(np.linalg.norm(xy[:, None] - xy[chosen], axis=2).min(axis=1))))
+            return int(path.stem), tuple({c.name: np.round(c.project(xyz[i]), 1) for c in cameras} for i in chosen)
+    return 0, ()
 
 
 def _alike(runs: Sequence[Run], monitor: Monitor) -> None:
@@ -141,7 +173,10 @@ def as_row(measure: Measure) -> dict[str, Any]:
 
 
 def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
-    """The measures in two run.json. A constraint makes residuals small by definition, and the methods track points of other spacings."""
+    """The measures in two run.json. A constraint makes residuals small by definition, and the methods track points of other spacings.
+
+    A single frame has no trajectories.
+    """
 
     def removed(track: dict[str, Any]) -> float:
         started = track.get("started", 0)
@@ -156,7 +191,9 @@ def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
         (BODY, "reported sigma of a joint (median)", "mm", NEITHER, lambda s: s.get("fit", {}).get("joint_sigma_mm")),
         (TIME, "duration of all stages", "s", LOWER, lambda s: sum(v.get("seconds", 0.0) for v in s.values()) if s else None),
     )
-    values = [[float(v) if (v := of(run["stages"])) is not None else float("nan") for run in runs] for *_, of in wanted]
+    single = [run["frames"][1] - run["frames"][0] == 1 if "frames" in run else False for run in runs]
+    stages = [{k: v for k, v in run["stages"].items() if k != "track" or not one} for run, one in zip(runs, single)]
+    values = [[float(v) if (v := of(s)) is not None else float("nan") for s in stages] for *_, of in wanted]
     return [Measure(group=g, name=n, unit=u, published=a, default=b, better=c) for (g, n, u, c, _), (a, b) in zip(wanted, values)]
 
 

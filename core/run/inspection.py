@@ -18,9 +18,12 @@ from ..images.interlace import RowGrid
 from ..matching.patches import patch_offsets
 from ..matching.seeds import approximations_at_depth
 from ..motion.formats.ply import read_ply
+from ..report.patch_picture import MOST_VIEWS, MatchedPatch
+from ..take.footage import Footage
 from ..tracking.settings import TrackStatus
 
 SAME_M = 2e-6  # largest difference between a point's coordinates in the checkpoint and in the PLY file, of single precision
+EXAMPLES, MUCH = 200, 0.9  # points among which one is chosen, and the quantile of what matching changed: those beyond lie at outlines
 CHECKPOINT = {  # of a frame's surface: the arrays shown
     "cloud_xyz_m": ("f", "N3"), "grid": ("iu", "4"), "field_xy": ("f", "NK2"), "field_shape": ("f", "NK22"), "field_cell": ("iu", "N"),
     "field_residual_px": ("f", "N"), "field_correlation": ("f", "N"),
@@ -164,6 +167,30 @@ def patch_boxes(
     start = approximations_at_depth(cameras, reference, rows, middle[None, reference], np.array([depth]))
     begun = start.xy[0][:, None] + np.einsum("kij,cj->kci", start.shape[0], corners * points.reduction[reference])
     return rows.to_frame(begun), rows.to_frame(found)
+
+
+def example_of_matching(out: Path, frame: int, footage: Footage, patch_px: int) -> MatchedPatch | None:
+    """Of the points of a frame that are known best, one whose patch matching changed by much, in the reference view and two others.
+
+    None without checkpoint.
+    """
+    cameras, reference, rows = footage.rig.cameras, footage.take.reference, footage.take.rows_at(frame)
+    points = read_points(out, frame, cameras, rows)
+    if points is None or not len(points.xyz_m):
+        return None
+    known = np.flatnonzero(np.isfinite(points.middle_px[:, reference, 0]) & (points.sigma_m <= np.median(points.sigma_m)))
+    found = list[tuple[float, MatchedPatch]]()
+    for row in known[:: max(1, len(known) // EXAMPLES)].tolist():
+        start_px, found_px = patch_boxes(points, row, cameras, reference, rows, patch_px)
+        others = [k for k in range(len(cameras)) if k != reference and np.isfinite([start_px[k], found_px[k]]).all()]
+        views = [reference, *others[: MOST_VIEWS - 1]]
+        if others:
+            change = min(float(np.linalg.norm(found_px[k] - start_px[k], axis=1).max()) for k in views[1:])
+            px_per_m = np.array([cameras[k].focal_px / cameras[k].to_camera(points.xyz_m[row])[2] for k in views])
+            boxes = {"start_px": start_px[views], "found_px": found_px[views]}
+            found.append((change, MatchedPatch(frame=frame, views=tuple(views), px_per_m=px_per_m, **boxes)))
+    found.sort(key=lambda entry: entry[0])
+    return found[int(MUCH * (len(found) - 1))][1] if found else None
 
 
 def read_tracks(out: Path) -> TrackHistory | None:

@@ -62,6 +62,7 @@ from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .engine import Engine
 from .file_digests import reads_content
 from .fitted_body import FittedBody, read_fitted, write_fitted
+from .inspection import example_of_matching
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
@@ -169,12 +170,19 @@ def report(run: Run, monitor: Monitor) -> None:
         trajectories=run.trajectories,
         body=run.body,
         silhouettes=run.silhouettes,
+        patch=example_of_matching(run.results.folder, _example_frame(run), run.footage, run.settings["matching"].patch_px),
         doubtful=doubtful_frames(frame_table(run.measured.summaries, run.trajectories, run.body), run.body),
         close_ups=run.close_ups,
         colour_limits=run.colour_limits,
     )
     write_report(run.results, shown, monitor, run.pictured)
     run.finish_stage("report", began)
+
+
+def _example_frame(run: Run) -> int:
+    """The frame of which a point's matching is shown: one that is pictured, or the middle one."""
+    frames = run.footage.frames
+    return run.pictured[len(run.pictured) // 2] if run.pictured else frames[len(frames) // 2]
 
 
 def run(

@@ -108,6 +108,11 @@ def test_the_plot_shows_every_field(tmp_path: Path, capsys: pytest.CaptureFixtur
     words = "".join(root.itertext())
     assert all(name in told and words.count(f"{name}: r_t") == 2 for name in NAMES) and "w_t = 0.5" in words
     svg = "{http://www.w3.org/2000/svg}"
-    assert len(list(root.iter(f"{svg}polyline"))) == len(list(root.iter(f"{svg}circle"))) == 2 * len(NAMES)
+    curves, dots = list(root.iter(f"{svg}polyline")), list(root.iter(f"{svg}circle"))
+    assert len(curves) == len(dots) == 2 * len(NAMES)
+    for curve, dot in zip(curves, dots):  # the dot, at r_t and w_t, is on its curve, which falls
+        xy = np.array([pair.split(",") for pair in curve.attrib["points"].split()], dtype=float)
+        assert abs(np.interp(float(dot.attrib["cx"]), *xy.T) - float(dot.attrib["cy"])) < 0.5 and (np.diff(xy[:, 1]) > -1e-6).all()
+    assert len({dot.attrib["cx"] for dot in dots[: len(NAMES)]}) > 2 and len({dot.attrib["cx"] for dot in dots[len(NAMES) :]}) == 1
     assert main(["fields", "--out", str(tmp_path / "fields.png")]) == 2 and not (tmp_path / "fields.png").exists()
     assert "is not an .svg" in capsys.readouterr().err

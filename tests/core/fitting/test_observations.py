@@ -75,6 +75,29 @@ def _cases(parameters: ShapeParameters, state, rng):
     ]
 
 
+@pytest.mark.parametrize("form", ["paper", "metric"])
+def test_a_point_is_attracted_by_the_field_of_its_part(form: str) -> None:
+    """Eq. 15, ½ − F in units of its sigma √(2 ln 2) σ/l, saturates far away; the metric one grows with the distance."""
+    parameters = _parameters("arm.R")
+    state = parameters.state(np.zeros(len(parameters.skeleton.dofs)), parameters.vector())
+    middle = state.head_m[1] + 0.5 * state.lengths_m[1] * state.R[1][:, 1]
+    sigma = 0.002
+    distance = np.linspace(0.0, 0.3, 3001)
+    ray = middle + distance[:, None] * state.R[1][:, 0]
+    part = PartField(state.parts[1], state, ray)
+    points = SurfacePoints.about(state, xyz_m=ray, bone=np.ones(len(ray), int), sigma_m=np.full(len(ray), sigma), form=form)
+    found, on = points.residual(state), int(np.argmin(np.abs(part.F - 0.5)))
+    assert abs(found[on]) < 0.05
+    if form == "paper":
+        mean = state.balls.radii_m[state.parts[1].balls][:, [0, 2]].mean()
+        assert np.allclose(found, (0.5 - part.F) / (sigma * np.sqrt(2 * np.log(2)) / mean)) and found[-1] == pytest.approx(
+            found[-2], rel=1e-3
+        )
+    else:
+        assert found[on + 20] - found[on] == pytest.approx(1.0, rel=0.1), "20 steps of 0.1 mm are a sigma"
+        assert found[-1] > 5 * found[on + 200] > 0
+
+
 def _collisions(state, rng):
     """Places on the last bone that are less than a large radius away from the bone before it."""
     last = len(state.lengths_m) - 1

@@ -8,7 +8,8 @@ import pytest
 from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, one_ball_shape
-from tricap.core.fitting.segmentation import SegmentationCache, facing_bone
+from tricap.core.fitting.inputs.cloud_points import CloudPoints
+from tricap.core.fitting.segmentation import SegmentationCache, facing_bone, gap_to_bone, segment
 from tricap.core.fitting.state import ShapeParameters
 
 
@@ -28,6 +29,28 @@ def test_points_of_the_surface_are_no_distance_from_it(name: str, balls: str) ->
             normal = -field_and_derivatives(state.balls, state.lengths_m, state.R, state.head_m, X, counted)[1]
             gap, along, facing = facing_bone(X, normal, state, np.full(len(X), b))
             assert abs(gap[0]) < 2e-3 and abs(along[0] - f) < 1e-9 and facing[0]  # it was 12 mm off at the neck
+
+
+def test_points_belong_to_the_limb_on_whose_surface_they_lie() -> None:
+    """A body with a bent arm before its trunk: points of every limb's surface, in the middle of the bone; and none far from all limbs."""
+    shape = default_shape(read_model("full"))
+    parameters, motion, names = ShapeParameters(shape), np.zeros(len(shape.skeleton.dofs)), [bone.name for bone in shape.skeleton.bones]
+    for dof, degrees in {"shoulder.R flexion": 30, "elbow.R flexion": 100, "knee.L flexion": 40}.items():
+        motion[shape.skeleton.layout[dof]] = np.radians(degrees)
+    state = parameters.state(motion, parameters.vector())
+    of = np.repeat([names.index(n) for n in ("upper_arm.R", "forearm.R", "forearm.L", "thigh.L", "shin.L", "thigh.R", "shin.R")], 60)
+    random = np.random.default_rng(0)
+    along, angle = random.uniform(0.35, 0.65, len(of)), random.uniform(0, 2 * np.pi, len(of))
+    out = np.cos(angle)[:, None] * state.R[of][:, :, 0] + np.sin(angle)[:, None] * state.R[of][:, :, 2]
+    axis = state.head_m[of] + (along * state.lengths_m[of])[:, None] * state.R[of][:, :, 1]
+    X = axis - gap_to_bone(axis, state, of)[:, None] * out
+    X -= gap_to_bone(X, state, of)[:, None] * out  # limbs are not round
+    far, surface = X[:1] + [3.0, 0.0, 0.0], np.tile([0.0, 1.0], (len(names), 1))
+    normals, sigma = np.concatenate([out, out[:1]]), np.full(len(X) + 1, 0.003)
+    points = CloudPoints(frame=0, xyz_m=np.concatenate([X, far]), normals=normals, sigma_m=sigma)
+    rows, bone = segment(points, state, surface, 0.03)
+    assert len(X) not in rows and len(rows) > 0.9 * len(X)
+    assert (bone == of[rows]).mean() > 0.97
 
 
 def test_held_segments_are_found_anew_when_the_body_grows() -> None:

@@ -223,6 +223,7 @@ def test_pull_in_range() -> None:
 
 
 USUAL = MatchingSettings()
+NOISE = np.random.default_rng(3).standard_normal((2, SIZE, SIZE))
 
 
 def refused(settings: MatchingSettings = USUAL, a: np.ndarray | None = None, b: np.ndarray | None = None,
@@ -242,6 +243,12 @@ def test_every_refusal_has_its_status() -> None:
     assert refused(replace(MatchingSettings(), max_shift_px=0.5), start=(151.0, 150.0)) == MatchStatus.SHIFT_TOO_LARGE
     assert refused(replace(MatchingSettings(), max_sigma_px=0.01)) == MatchStatus.SIGMA_TOO_LARGE
     assert refused(replace(MatchingSettings(), max_sigma0=1.0)) == MatchStatus.SIGMA0_TOO_LARGE
+    for axis in (0, 1):  # the displacements and the sigmas are limited in x and in y, each by itself
+        away = (149.0, 149.7) if axis == 0 else (150.4, 151.0)
+        assert refused(replace(MatchingSettings(), max_shift_px=0.8), start=away) == MatchStatus.SHIFT_TOO_LARGE
+        a, b = (np.repeat(g.mean(axis=1 - axis, keepdims=True), SIZE, axis=1 - axis) for g in noisy_pair(1.5, 1.0, (0, 0), 0))
+        a, b = (90 + 60 * (g - g.mean()) / g.std() + noise for g, noise in ((a, NOISE[0]), (b, NOISE[1])))
+        assert refused(replace(USUAL, max_sigma_px=0.02), a=a, b=b) == MatchStatus.SIGMA_TOO_LARGE, "stripes"
     assert refused(replace(MatchingSettings(), min_correlation=0.999)) == MatchStatus.LOW_CORRELATION
     assert refused(b=flat) != MatchStatus.OK and refused(b=other) != MatchStatus.OK
 

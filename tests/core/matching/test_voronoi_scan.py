@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
+from tricap.core.matching import voronoi_scan as scan_module
 from tricap.core.matching.constraints import fit_neighbours
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.least_squares import MatchingSettings
@@ -18,17 +20,22 @@ from tricap.core.matching.views import Views, template_grid
 from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, unlike_neighbours, voronoi_scan
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
+SEEDS_PX = np.array([[110.0, 90.0], [210.0, 130.0]])
+FLAT = SplineImage(np.full((240, 320), 80.0))
+
+
+def scene_of(surfaces: ModuleType, surface: Any, spacing_px: int, xy: np.ndarray, kind: str = "strong"):
+    """The surface, the rig, the views, a grid, and seeds at pixels of the centre view."""
+    rig, grey = surfaces.render(surface, kind)
+    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=1, rows=RowGrid())
+    depth = surface.hit(rig[1].centre_m, rig[1].rays(xy))[0]
+    grid = template_grid(views.template.shape, RowGrid(), spacing_px)
+    return surface, rig, views, grid, approximations_at_depth(rig, 1, RowGrid(), xy, depth)
 
 
 @pytest.fixture(scope="module")
 def scene(surfaces: ModuleType):
-    surface = surfaces.plane(0.3)
-    rig, grey = surfaces.render(surface, "strong")
-    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=1, rows=RowGrid())
-    grid = template_grid(views.template.shape, RowGrid(), 6)
-    xy = np.array([[110.0, 90.0], [210.0, 130.0]])
-    depth = surface.hit(rig[1].centre_m, rig[1].rays(xy))[0]
-    return surface, rig, views, grid, approximations_at_depth(rig, 1, RowGrid(), xy, depth)
+    return scene_of(surfaces, surfaces.plane(0.3), 6, SEEDS_PX)
 
 
 def run(scene, seeds: Approximations | None = None, matching: MatchingSettings | None = None, **growing):
@@ -56,13 +63,20 @@ def test_two_seeds_cover_the_surface(scene) -> None:
     assert (np.diff(field.cell) > 0).all()
 
 
-def test_search_images_are_independent(scene) -> None:
-    """A search image without content loses its own matches, and so all points; the other's scan is complete."""
+@pytest.mark.parametrize("blinded", [0, 2])
+def test_search_images_are_independent(scene, monkeypatch: pytest.MonkeyPatch, blinded: int) -> None:
+    """A search image without content loses its own matches, and so all points; the other's are the same to the last bit."""
     _, _, views, grid, seeds = scene
-    blind = replace(views, images=[*views.images[:2], SplineImage(np.full(views.images[2].shape, 80.0))])
-    field = voronoi_scan(blind, grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
-    assert len(field.cell) == 0
-    assert field.tried > 0.5 * grid.shape[0] * grid.shape[1]
+    scans = list[list[_Scan]]()
+    merged = scan_module._merged
+    monkeypatch.setattr(scan_module, "_merged", lambda found, *rest: scans.append(found) or merged(found, *rest))
+    for images in (views.images, [image if k != blinded else FLAT for k, image in enumerate(views.images)]):
+        field = voronoi_scan(
+            replace(views, images=images), grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor()
+        )
+    whole, other = (found[1 - blinded // 2] for found in scans)
+    assert len(field.cell) == 0 and not scans[1][blinded // 2].found.any()
+    assert whole.found.mean() > 0.5 and np.array_equal(whole.found, other.found) and np.array_equal(whole.xy, other.xy)
 
 
 def begun(scene, settings: MatchingSettings) -> _Scan:
@@ -88,22 +102,55 @@ def test_regions_are_voronoi_and_holes_close(scene) -> None:
     assert one.found.sum() >= 0.99 * covered
 
 
-def test_filter_removes_what_is_unlike_and_matches_it_again(scene) -> None:
+def test_failed_matches_are_repeated_with_bigger_patches(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the limits of strong texture, which not every patch of 13 px keeps to. Measured: 8 % fewer points without."""
+    found = {}
+    for bigger in (scan_module.BIGGER_PX, ()):
+        monkeypatch.setattr(scan_module, "BIGGER_PX", bigger)
+        one = begun(scene, limits_of("strong", MatchingSettings()))
+        one.cover()
+        found[bigger] = int(one.found.sum())
+    assert found[()] < 0.97 * found[4, 8]
+
+
+def test_failed_matches_are_repeated_with_half_the_shift(surfaces: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shifts of 20 px on a limb of 3 cm: its curvature leads astray. Measured: 22 points, without 15."""
+    scene = scene_of(surfaces, surfaces.cylinder(0.06), 20, np.array([[160.0, 90.0], [160.0, 130.0]]))
+    found = []
+    for _ in range(2):
+        one = begun(scene, limits_of("strong", MatchingSettings()))
+        one.cover()
+        found.append(int(one.found.sum()))
+        monkeypatch.setattr(_Scan, "_half_way", lambda *_: None)
+    assert found[0] >= 1.2 * found[1] > 0
+
+
+def test_filter_removes_what_is_unlike_and_matches_it_again(scene, monkeypatch: pytest.MonkeyPatch) -> None:
     one = begun(scene, MatchingSettings())
     one.cover()
-    wrong = np.flatnonzero(one.found)[50:500:45]
+    covered = np.flatnonzero(one.found)
+    wrong = covered[50:500:45]
     truth = one.centre[wrong].copy()
     one.centre[wrong] += 2.5
     one.shape[wrong, 0, 1] += 0.4
+    with monkeypatch.context() as alone:
+        alone.setattr(_Scan, "_best", lambda *_: None)  # nothing is matched again
+        one.filter_and_repeat()
+    assert not one.found[wrong].any() and one.found[covered].mean() > 0.8
+    one.found[wrong] = True
     one.filter_and_repeat()
     assert one.found[wrong].mean() > 0.85
     assert np.median(np.abs(one.centre[wrong] - truth)) < 0.05
 
 
 @pytest.mark.slow
-def test_texture_cases_are_ordered(scene) -> None:
-    counts = [len(run(scene, texture=t).cell) for t in ("strong", "clothing", "skin")]
-    assert counts[0] <= counts[1] <= counts[2] * 1.02
+def test_texture_cases_are_ordered(scene, surfaces: ModuleType) -> None:
+    """Measured: 1377, 1445 and 1451 points of strong texture; of weak texture none, none, and 1313."""
+    counts = [len(run(scene, texture=t).cell) for t in CASES]
+    assert counts[0] < 0.98 * counts[1] and counts[1] <= 1.02 * counts[2]
+    weak = scene_of(surfaces, surfaces.plane(0.3), 12, SEEDS_PX, "weak")
+    counts = [len(run(weak, texture=t).cell) for t in CASES]
+    assert counts[0] <= counts[1] < 0.2 * counts[2] and counts[2] > 100
     assert limits_of("own", MatchingSettings(max_sigma_px=0.11)).max_sigma_px == 0.11
     assert limits_of("strong", MatchingSettings()).max_sigma0 == CASES["strong"].max_sigma0
 

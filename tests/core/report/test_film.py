@@ -25,11 +25,11 @@ ARM = default_shape(read_model("arm.R"))
 
 @pytest.fixture
 def results(tmp_path: Path) -> Results:
-    """The files of a fitted arm in two frames of the plane's take."""
+    """The files of a fitted arm in two frames of the plane's take, 4 cm further to the right in the second."""
     results, rows = Results(tmp_path / "out"), ["frame,time_s,joint,x,y,z,sigma"]
     for frame in (1, 2):
         values = np.zeros(len(ARM.skeleton.dofs))
-        values[:3] = 0.15, 0.0, 1.9
+        values[:3] = 0.11 + 0.04 * frame, 0.0, 1.9
         skin = body_skin(ARM, values, SkinSettings())
         write_mesh(results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
         places = joint_positions(ARM.skeleton, ARM.lengths_m, values).items()
@@ -47,9 +47,13 @@ def test_the_body_is_over_every_frame(plane_take: Path, results: Results) -> Non
     assert len(pictures) == 2 and pictures[0].shape[1] <= WIDTH_PX and height <= HEIGHT_PX
     assert height > 1.2 * footage.rig.cameras[0].size_px[1], "small footage is enlarged"
     assert movie.get(cv2.CAP_PROP_FPS) == footage.take.fps
-    for k in range(3):  # the skin is orange; the footage is grey
-        panel = pictures[0][:height, k * width : (k + 1) * width].astype(int)
-        assert 0.05 < (panel[..., 2] - panel[..., 0] > 30).mean() < 0.5
+    for k, camera in enumerate(footage.rig.cameras):  # the skin is orange; the footage is grey
+        orange = [p[:height, k * width : (k + 1) * width].astype(int) for p in pictures]
+        orange = [p[..., 2] - p[..., 0] > 30 for p in orange]
+        assert 0.05 < orange[0].mean() < 0.5
+        moved = np.subtract(*(np.argwhere(p).mean(axis=0) for p in orange[::-1]))[::-1]  # of its middle
+        asked = np.subtract(*camera.project(np.array([[0.19, -0.1, 1.9], [0.15, -0.1, 1.9]])))
+        assert moved @ asked > 0.9 * np.linalg.norm(moved) * np.linalg.norm(asked) and np.linalg.norm(moved) > 0.7 * np.linalg.norm(asked)
     assert not results.path("cache", "film.mp4").exists()
 
 

@@ -247,7 +247,7 @@ def test_vectors_point_where_the_points_go(scenes: Any) -> None:
     empty = with_kinematics(np.arange(1), np.arange(1) / 10, xyz[:1], np.full((1, 3), 1e-3), np.ones((1, 3), dtype=np.int8), 0)
     assert longest_vectors(empty, 0) == {} == vector_pictures(empty, camera, 0, longest), "a single frame has no velocities"
     (slow, paler), _ = vector_pictures(tracks, camera, 2, longest | {"velocity": 0.8}).values()
-    hue = np.split(paler, 2, axis=1)[0][round(TITLE_PX) :][:SIDE_PX]
+    hue = np.split(paler, 2, axis=1)[0][round(TITLE_PX * OF_PANELS) :][:SIDE_PX]
     assert "longest: 0.8 m/s" in slow and not ((hue[..., 2].astype(int) - hue[..., 0] > 60) & (hue[..., 1] < 120)).any()
 
 

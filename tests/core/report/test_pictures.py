@@ -143,6 +143,15 @@ def test_chosen_points_are_joined_and_have_names_within_the_image() -> None:
     assert name[:, :184].sum() > 30 and not name[:, 192:].any()
 
 
+@pytest.mark.parametrize("step", [-4.0, 4.0])
+def test_a_name_lies_where_its_path_does_not(step: float) -> None:
+    """Left of a path that goes to the left, right of one that goes to the right."""
+    path = np.stack([100 + step * np.arange(10), np.full(10, 60.0)], axis=1)[:, None]
+    bare, named = (paths_over_footage(GREY, (name,), path, 9).astype(int) for name in ("", "nose"))
+    columns = np.flatnonzero(np.abs(named - bare).max(axis=2).any(axis=0))
+    assert columns.max() < path[-1, 0, 0] if step < 0 else columns.min() > path[-1, 0, 0]
+
+
 def test_paths_of_chosen_points_have_names(scenes: Any) -> None:
     """In both panels, where a point was last seen; a point that never was has none."""
     xyz = np.stack([np.linspace([-0.05, 0, 2.0], [0.05, 0, 2.0], 4), np.linspace([0, 0.05, 2.0], [0, 0.1, 2.1], 4)], axis=1)

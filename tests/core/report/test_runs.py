@@ -70,9 +70,10 @@ def test_fewer_frames_leave_no_clouds_of_others(plane_take: Path, out: Path) -> 
 
 
 def test_one_frame_is_a_run(plane_take: Path, tmp_path: Path) -> None:
-    """Nothing can be tracked in one frame; the report is made all the same."""
+    """Nothing can be tracked in one frame; the report is made all the same, without pictures of no trajectories."""
     job = pipeline.run(plane_take, tmp_path / "out", frames=(0, 1))
     assert (tmp_path / "out" / "report" / "report.html").exists() and "1 frames" in str(job)
+    assert {path.stem.partition("_")[0] for path in (tmp_path / "out" / "report").glob("*.png")} == {"patches", "surface", "cloud"}
 
 
 def test_restart_measures_anew(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,6 +75,17 @@ def test_the_page_groups_measures_and_describes_pictures(tmp_path: Path) -> None
     assert "removed by the filters" in page and page.count("<img") == 6
 
 
+@pytest.fixture
+def clicked_take(plane_take: Path, tmp_path: Path, scenes: Any) -> Path:
+    """The plane with a point of its surface clicked in the first frame."""
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    pixels = ", ".join(
+        "{} = [{:.1f}, {:.1f}]".format(c.name, *c.project([0.0, 0.0, scenes.depth_m])) for c in scenes.three_cameras().cameras
+    )
+    (take / "take.toml").write_text((take / "take.toml").read_text() + f"[seeds]\nsurface = [{{ {pixels} }}]\n")
+    return take
+
+
 def test_values_are_short() -> None:
     assert [written(v) for v in (np.nan, 0.0, 12_345.6, 98.163, 0.25, 100.0)] == ["–", "0", "12,346", "98.2", "0.250", "100"]
 
@@ -125,10 +136,10 @@ def test_found_joints_do_not_replace_clicks() -> None:
     assert [(k.frame, sorted(k.joints)) for k in moved.keyframes] == [(0, ["head"])]
 
 
-def test_where_the_published_method_cannot_run(plane_take: Path, tmp_path: Path, capsys: Any) -> None:
-    """A plane without clicks: the default's results alone, and the page says why."""
+def test_where_the_published_method_cannot_run(clicked_take: Path, tmp_path: Path, capsys: Any) -> None:
+    """A plane that was clicked in a frame that is left out: the default's results alone, and the page says why."""
     out = tmp_path / "out"
-    assert main(["compare", str(plane_take), "--out", str(out), "--frames", "0:1"]) == 0
+    assert main(["compare", str(clicked_take), "--out", str(out), "--frames", "1:2"]) == 0
     said, page, table = capsys.readouterr().out, (out / "compare.html").read_text(), json.loads((out / "compare.json").read_text())
     assert table["notes"][0].startswith("The published method could not run: ") and table["notes"][0] in said
     assert "Only the default method ran." in page and "could not run" in page and "published: " not in page
@@ -140,13 +151,21 @@ def test_where_the_published_method_cannot_run(plane_take: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_both_methods_on_a_take(plane_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
+def test_without_a_body_and_clicks_measured_points_are_clicks(plane_take: Path, tmp_path: Path, capsys: Any) -> None:
+    """The published method covers most of the plane from them, and a single frame has no measures of trajectories."""
+    out = tmp_path / "out"
+    assert main(["compare", str(plane_take), "--out", str(out), "--frames", "0:1", "--json", "--quiet"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    (note,) = json.loads((out / "compare.json").read_text())["notes"]
+    assert "began from 6 points" in note and "in frame 0" in note and note[:30] in (out / "compare.html").read_text()
+    assert rows["points a frame"]["published"] > 0.7 * rows["points a frame"]["default"] > 70
+    assert {rows[name][method] for name in rows if "traj" in name for method in METHODS} == {None}
+
+
+@pytest.mark.slow
+def test_both_methods_on_a_take(clicked_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
     """Two runs in folders of their own, one page and one table; a second call computes nothing."""
-    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
-    pixels = ", ".join(
-        "{} = [{:.1f}, {:.1f}]".format(c.name, *c.project([0.0, 0.0, scenes.depth_m])) for c in scenes.three_cameras().cameras
-    )
-    (take / "take.toml").write_text((take / "take.toml").read_text() + f"[seeds]\nsurface = [{{ {pixels} }}]\n")
+    take, out = clicked_take, tmp_path / "out"
     command = ["compare", str(take), "--out", str(out), "--frames", "0:2", "--json", "--quiet"]
     assert main(command) == 0
     first = json.loads(capsys.readouterr().out)

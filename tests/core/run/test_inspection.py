@@ -10,10 +10,14 @@ import pytest
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import write_mesh
+from tricap.core.report.drawing import STRIP_PX, TITLE_PX
+from tricap.core.report.patch_picture import FOUND, LETTERS, START, patch_picture
 from tricap.core.run import pipeline
-from tricap.core.run.inspection import body_outline, patch_boxes, read_points, read_tracks
+from tricap.core.run.inspection import body_outline, example_of_matching, patch_boxes, read_points, read_tracks
 from tricap.core.take.footage import Footage
 from tricap.core.tracking.settings import TrackStatus
+
+TOP, STRIP = round(TITLE_PX * LETTERS), round(STRIP_PX * LETTERS)  # of a picture, without the image
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +50,28 @@ def test_patches_show_the_same_texture_in_all_views(run: tuple[Footage, Path]) -
             cut = [_cut(image, box) for image, box in zip(images, boxes)]
             likeness[name] += [np.corrcoef(cut[1], cut[k])[0, 1] for k in (0, 2)]
     assert np.median(likeness["found"]) > 0.97 and np.median(likeness["found"]) > np.median(likeness["start"])
+
+
+def test_an_example_of_matching_is_one_point_in_three_views(run: tuple[Footage, Path], tmp_path: Path) -> None:
+    """The middle view first, where start and result are the same; its picture shows one texture within the white outlines."""
+    footage, out = run
+    example = example_of_matching(out, 1, footage, 13)
+    assert example is not None and example.views == (1, 0, 2) and example.frame == 1
+    assert np.allclose(example.start_px[0], example.found_px[0], atol=1e-6)
+    assert (np.abs(example.start_px - example.found_px).max(axis=(1, 2))[1:] > 0.2).all()
+    images = footage.read(1)
+    cut = [_cut(images[k], box) for k, box in zip(example.views, example.found_px)]
+    assert min(np.corrcoef(cut[0], other)[0, 1] for other in cut[1:]) > 0.9
+    caption, picture = patch_picture(example, images, ("left", "middle", "right"))
+    assert caption.startswith("Frame 1: least squares matching of one point.") and "faces view middle" in caption
+    white, black = ((picture == tint).all(axis=2)[TOP:-STRIP] for tint in (FOUND, START))
+    assert all(part.sum() > 300 for part in np.hsplit(white, 3)) and [part.sum() > 50 for part in np.hsplit(black, 3)] == [
+        False,
+        True,
+        True,
+    ]
+    shutil.copytree(out / "clouds", tmp_path / "clouds")
+    assert example_of_matching(tmp_path, 1, footage, 13) is None, "without checkpoints"
 
 
 def _cut(image: np.ndarray, box: np.ndarray) -> np.ndarray:

@@ -53,6 +53,17 @@ def test_the_same_input_gives_the_same_bytes(plane_take: Path, tmp_path: Path, s
         same(a, b)
 
 
+def test_every_frame_has_a_surface_of_its_own(tmp_path: Path, scenes: Any) -> None:
+    """A plane that comes nearer by 3 cm a frame: each cloud lies on the plane of its frame."""
+    first = scenes.Body(half_m=(0.2, 0.15))
+    planes = [first.moved(np.eye(3), [0.0, 0.0, -0.03 * i]) for i in range(3)]
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane] for plane in planes])
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
+    assert [m.frame for m in measured] == [m.cloud.frame for m in measured] == [0, 1, 2]
+    for m, plane in zip(measured, planes):
+        assert len(m.cloud.xyz_m) > 100 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.002
+
+
 @pytest.mark.parametrize("seed_frame", [0, 2])
 def test_a_resumed_run_is_the_same_run(
     plane_take: Path, tmp_path: Path, scenes: Any, seed_frame: int, monkeypatch: pytest.MonkeyPatch

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.tracking.filters import against_neighbours, against_voxels
+from tricap.core.tracking.filters import against_neighbours, against_voxels, over_thresholds
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, filter_trajectories, with_kinematics
 
@@ -139,3 +139,18 @@ def test_the_noise_is_added_to_the_thresholds() -> None:
     assert filter_trajectories(still, settings).kept.visible.mean() > 0.98
     fast = recording(np.arange(FRAMES)[:, None, None] * DT * np.ones((1, 5, 3)), random)
     assert filter_trajectories(fast, settings).kept.visible.shape[1] == 0
+
+
+def test_each_threshold_removes_what_exceeds_it_and_nothing_else() -> None:
+    """Points that move at 1 m/s, at 3 m/s, and one that is pushed by 30 m/s² for a moment, under limits between."""
+    random, t = np.random.default_rng(0), np.arange(FRAMES) * DT
+    pushed = np.cumsum(np.cumsum(np.where(np.arange(FRAMES) == 12, 30.0, 0.0))) * DT**2
+    x = np.stack([1.0 * t, 3.0 * t, 0.5 * t + pushed], axis=1)[..., None] * np.array([1.0, 0.0, 0.0])
+    raw = recording(x, random)
+    settings = replace(SETTINGS, max_speed=2.5, max_acceleration=20.0)
+    verdict = over_thresholds(raw.velocity_m_s, raw.acceleration_m_s2, np.zeros_like(raw.sigma_m), DT, settings)
+    inner = np.abs(np.arange(FRAMES) - 12) > 2
+    assert (verdict[:, 0] == TrackStatus.MEASURED).all() and (verdict[1:-1, 1] == TrackStatus.TOO_FAST).all()
+    assert (verdict[~inner, 2] == TrackStatus.ACCELERATES).any() and (verdict[inner, 2] == TrackStatus.MEASURED).all()
+    off = replace(SETTINGS, max_speed=20.0, max_acceleration=500.0)
+    assert (over_thresholds(raw.velocity_m_s, raw.acceleration_m_s2, np.zeros_like(raw.sigma_m), DT, off) == TrackStatus.MEASURED).all()

@@ -1,5 +1,6 @@
 """The published step: it tracks a plane, finds accelerating points within its second box only, and does not control drift."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,11 @@ import pytest
 
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.interlace import FieldLayout
-from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.matching.least_squares import Matches, MatchingSettings
+from tricap.core.tracking import published_step, step
 from tricap.core.tracking.published_step import predict_in_images, search_radius
-from tricap.core.tracking.settings import TrackingSettings
-from tricap.core.tracking.step import TrackingView
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.step import TrackingView, match_spatially
 from tricap.core.tracking.tracked import TrackedFrame, born
 
 PUBLISHED = {"scheme": "published", "spacing_px": 12, "regenerate_every": 0}
@@ -67,3 +69,25 @@ def test_prediction_and_box(scenes: Any) -> None:
     near = frame(2, [[0.0, 0.0, 1.0]], cameras)
     assert np.allclose(search_radius(view, now)[:, 1], 30 * 0.08**2 * 600 / 2.0 + 2)
     assert search_radius(view.at(3), near)[0, 1] == pytest.approx(30 * 0.04**2 * 600 + 2) and search_radius(view, near).max() == 64
+
+
+@pytest.mark.parametrize("scheme", ["published", "space"])
+def test_points_whose_matches_contradict_each_other_are_given_up(
+    plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    """The spatial match of every twentieth point is made to lie 1 px away from the temporal one: these points end, and no others."""
+    wrong = list[int]()
+
+    def astray(view: TrackingView, points: TrackedFrame, *rest: Any) -> list[Matches]:
+        found, shift = match_spatially(view, points, *rest), 1.0 * (points.identity % 20 == 0)
+        wrong.extend(points.identity[points.identity % 20 == 0])
+        return [replace(m, xy=m.xy + shift[:, None]) for m in found]
+
+    measured = scenes.measure(plane_take, tmp_path / "out", frames=(0, 2))
+    for module in (step, published_step):
+        monkeypatch.setattr(module, "match_spatially", astray)
+    knobs = {"scheme": scheme, "bridge_frames": 0, "wait_frames": 0, "regenerate_every": 0}
+    _, after = scenes.track(plane_take, tmp_path / "out", measured, {"tracking": knobs})
+    given_up = dict(zip(after.ended.tolist(), after.reason.tolist()))
+    assert len(set(wrong)) >= 3 and all(given_up[point] == TrackStatus.NOT_VERIFIED for point in set(wrong))
+    assert len(given_up) < len(set(wrong)) + 0.1 * len(after.identity)

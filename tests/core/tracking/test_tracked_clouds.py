@@ -1,13 +1,21 @@
 """The surface of each frame cleaned by tracking: its files, and as the cloud of a fit."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from tricap.core.fitting.inputs.cloud_points import thinned, tracked_clouds
+from tricap.core.fitting.inputs.cloud_points import Cloud, thinned, tracked_clouds
+from tricap.core.fitting.inputs.completed_clouds import clouds_for_fit
+from tricap.core.fitting.settings import FitSettings
 from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.formats.ply import read_ply
+from tricap.core.results.folder import Results
+from tricap.core.surface.cloud import PointCloud
+from tricap.core.take.footage import Footage
 from tricap.core.tracking.settings import TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, with_kinematics, write_tracked_clouds
 
@@ -37,3 +45,14 @@ def test_as_clouds_for_the_fit(tracks: Trajectories) -> None:
     assert [(c.frame, len(c.xyz_m)) for c in clouds] == [(4, 0), (5, 3), (6, 2), (7, 0)]
     points = thinned(clouds[1], 0.008)
     assert len(points.xyz_m) == 3 and np.allclose(points.sigma_m, 0.003 / np.sqrt(3)) and not points.normals.any()
+
+
+def test_the_fit_rests_on_them_where_that_is_asked_for(tracks: Trajectories, tmp_path: Path) -> None:
+    """`fitting.cloud=tracked`; by default on the measured ones."""
+    footage, measured = cast(Footage, SimpleNamespace(frames=range(5, 8))), cast(Sequence[PointCloud], [object()])
+
+    def clouds(**settings: str) -> Sequence[Cloud]:
+        return clouds_for_fit(footage, measured, tracks, (), FitSettings(**settings), Results(tmp_path), Monitor())
+
+    assert clouds() is measured
+    assert [(c.frame, len(c.xyz_m)) for c in clouds(cloud="tracked")] == [(5, 3), (6, 2), (7, 0)]

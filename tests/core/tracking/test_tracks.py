@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.tracking.step import TrackStatus
@@ -105,7 +106,8 @@ def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
 
 
 def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any) -> None:
-    """A plane comes into the picture: later frames have as many points per area as the first."""
+    """A plane comes into the picture: later frames have as many points per area as the first, no closer, and new ones in every second
+    frame only."""
     plane = scenes.Body(half_m=(0.5, 0.18), R=rotation_from_vector(np.array([0.1, 0.15, 0.0])), t=np.array([-0.75, 0.0, 2.16]))
     bodies = [plane.moved(np.eye(3), [0.05 * i, 0.0, 0.0]) for i in range(6)]
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
@@ -116,6 +118,12 @@ def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any
     assert len(steps[4].identity) > 0.75 * growth[4] * len(steps[0].identity)
     identities = np.concatenate([s.identity for s in steps])
     assert all((np.diff(s.identity) > 0).all() for s in steps) and identities.max() + 1 == len(np.unique(identities))
+    known = np.unique(steps[0].identity)
+    for i, s in enumerate(steps[1:], start=1):
+        assert np.isin(s.identity, known).all() == bool(i % 2), "new points start at the interval that was asked for"
+        known = np.union1d(known, s.identity)
+    closest = [np.sort(cKDTree(xy).query(xy, 2)[0][:, 1])[5] for xy in (steps[i].xy[:, 1] for i in (0, 4))]
+    assert closest[1] > 0.7 * closest[0], "and only where there are none"
     none = scenes.track(take, tmp_path / "none", measured, {"tracking": {"regenerate_every": 0}})
     assert all(set(s.identity) <= set(none[0].identity) for s in none)
     assert all(len(s.ended) == len(np.unique(s.ended)) for s in steps)
