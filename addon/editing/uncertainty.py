@@ -87,6 +87,12 @@ def redraw(context: bpy.types.Context) -> None:
                 area.tag_redraw()
 
 
+def forget() -> None:
+    """Read the sigmas again when they are shown next: they have changed."""
+    get_session().file.uncertainty = ((), None)
+    redraw(bpy.context)
+
+
 def _shown() -> tuple[bpy.types.Object, Sigmas] | None:
     """The body whose uncertainty is shown, and its sigmas, which are read once."""
     scene = bpy.context.scene

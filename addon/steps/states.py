@@ -111,6 +111,7 @@ class _Project:
     run: Mapping[str, Any] | None = None
     problem: str = ""  # why run.json cannot be read
     out: Path | None = None
+    frames_again: str = ""  # fitted again to the clicks as they are now
 
 
 def compute(scene: bpy.types.Scene) -> StepStates:
@@ -277,13 +278,24 @@ def _stage(step: str, states: Mapping[str, State], found: _Project) -> State:
         before = states[STEPS[STEPS.index(step) - 1]].status if step != "surface" else Status.DONE
         return State(status=Status.READY if before == Status.DONE else Status.EMPTY, message=_READY[step])
     if entry.get("key") != found.keys[stage]:
-        return State(status=Status.STALE, message=OUTDATED)
+        found.frames_again = _frames_again(found, entry) if step == "body" else ""
+        again = f"Frames {found.frames_again} were fitted again to your clicks. Fit Body also adjusts the shape and all other frames."
+        return State(status=Status.STALE, message=again if found.frames_again else OUTDATED)
     if "not_done" in entry and step != "body":
         return State(status=Status.DONE, message=f"Skipped: {entry['not_done']}.")
     if "not_done" in entry:
         status = Status.READY if states["clicks"].status == Status.DONE else Status.EMPTY
         return State(status=status, message=f"No body was fitted: {entry['not_done']}.")
     return State(status=Status.DONE, message=_figures(step, entry))
+
+
+def _frames_again(found: _Project, fit: Mapping[str, Any]) -> str:
+    """The frames that *Fit Again* fitted to the clicks as they are now, in words; "" if more than these clicks has changed."""
+    if not fit.get("fitted_again") or found.footage is None or found.take is None or found.out is None:
+        return ""
+    from ...core.run.around_clicks import frames_again
+
+    return frames_again(fit, found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 
 _READY = {
@@ -325,7 +337,9 @@ def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -
         return State(status=Status.STALE, message="The body's armature is missing from the scene. Build it again.")
     now = found.keys or {}
     if found.keys is not None and any(now.get(stage) != key for stage, key in stored.table(built, KEYS_KEY).items()):
-        return State(status=Status.STALE, message="The scene shows an earlier result. Run the steps before, then build it again.")
+        again = f"The scene plays frames {found.frames_again} as they were fitted again. After Fit Body, build it again."
+        earlier = "The scene shows an earlier result. Run the steps before, then build it again."
+        return State(status=Status.STALE, message=again if found.frames_again else earlier)
     if found.keys is not None and lacks_results(built, found):
         return State(status=Status.STALE, message="There are results that the scene does not show yet. Build it again.")
     return State(status=Status.DONE, message="The armature plays the motion." if moving else "Surface and tracks are in the scene.")

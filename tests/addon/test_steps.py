@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tricap.__main__ import main
@@ -202,7 +203,7 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
 
 
 @pytest.mark.slow
-def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
+def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, why: Any, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
     scene, out = done, tmp_path / "out"
     with pytest.raises(RuntimeError, match="drag a joint first"):
@@ -235,13 +236,22 @@ def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done:
     values = motion.values[:, motion.dof_names.index("elbow.R flexion")]
     now = [channel().evaluate(frame) for frame in range(3)]
     assert now[:2] == pytest.approx(values[:2].tolist(), abs=1e-5) and now[2] == pytest.approx(values[2] + 0.5, abs=1e-5) and now != was
+    sigmas, own = importlib.import_module(f"{NAME}.editing.uncertainty").sigmas_of(body), after.frame_sigma_m
+    wanted = 1e3 * np.maximum(own["elbow.R"], own["wrist.R"])
+    assert sigmas["forearm.R"][1] == pytest.approx(wanted, rel=1e-5), "the sigmas are those of a rig that is built anew"
     entry = json.loads((out / "run.json").read_text())["stages"]["fit"]
     assert entry["fitted_again"] == [[0, 2]] and words().split()[5] == "stale", "a whole fit would adjust the shape, too"
+    assert why("body").startswith("Frames 0–2 were fitted again to your clicks. Fit Body also adjusts the shape")
+    assert why("rig").startswith("The scene plays frames 0–2 as they were fitted again")
     scene.tricap.fitting.gate_m = 0.04
+    assert why("body") == "Inputs have changed since this step ran. Run it again."
     assert blender.ops.tricap.fit_again() == {"FINISHED"} and words().split()[5] == "done", "more than clicks has changed: all is fitted"
 
 
-@pytest.mark.parametrize("text", ['{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])
+WRONG = '{"stages": {"fit": {"not_done": "", "fitted_again": [[0]]}}}'
+
+
+@pytest.mark.parametrize("text", [WRONG, '{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])
 def test_a_run_json_that_no_run_wrote(
     blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, tmp_path: Path, text: str
 ) -> None:
