@@ -106,7 +106,7 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             row.prop(context.scene.tricap, "fps", text="FPS of the Images")
         box.prop(context.scene.tricap, "model", text="Body")
     if now.can_run:
-        box.operator("tricap.run", icon="FF", text="Run Remaining Steps")
+        bodies.primary(box, "tricap.run", True, icon="FF", text="Run Remaining Steps")
     if is_sample(context.scene):
         box.operator("tricap.compute_sample", icon="FILE_REFRESH")
 

@@ -498,12 +498,15 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
 def test_everything_is_offered_only_when_nothing_else_is_next(blender: ModuleType, layout: Any, sample: Path, tmp_path: Path) -> None:
     panel, watch = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("panel", "watch"))
     scene = opened(blender, sample, tmp_path)
-    offered = []
+    offered, highlighted = [], []
     for model in ("arm.R", "leg.L", "none"):  # clicked; not clicked; no clicks needed
         scene.tricap.model = model
         watch.refresh(scene)
-        offered.append("tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators)
+        drawn = type(layout)().draw(panel.TRICAP_PT_main, blender.context)
+        offered.append("tricap.run" in drawn.operators)
+        highlighted.append(drawn.highlighted)
     assert offered == [True, False, True]
+    assert highlighted == [["tricap.run"], ["tricap.click_joints"], ["tricap.run"]], "one button is the next one to press"
 
 
 def test_the_report_is_opened_in_the_browser(blender: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
