@@ -561,7 +561,7 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
 
 
 def test_a_calibration_in_the_folder_of_the_footage_is_used(
-    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path
+    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path, capfd: Any
 ) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     shutil.copytree(sample, tmp_path / "film")
@@ -569,6 +569,13 @@ def test_a_calibration_in_the_folder_of_the_footage_is_used(
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
     assert words().startswith("done done") and blender.context.scene.camera.name == "Camera C"
+    write_rig(tmp_path / "film" / "rig.toml", renamed(read_rig(tmp_path / "film" / "rig.toml"), {"L": "R", "R": "L"}))
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "turned.blend"))
+    capfd.readouterr()
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    said = capfd.readouterr().out
+    assert said.count("from left to right") == 1 and "from left to right: R, C, L." in said, "the order is that of the cameras"
     (tmp_path / "film" / "rig.toml").write_text("damaged")
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
