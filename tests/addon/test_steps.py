@@ -202,6 +202,29 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
     assert "tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
 
 
+def test_where_the_fit_finds_nobody_the_panel_asks_for_clicks(
+    blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path
+) -> None:
+    """Running the same again would end as before. New clicks make the fit the next step."""
+    shutil.copytree(results, tmp_path / "out")
+    scene, panel = opened(blender, sample, tmp_path), importlib.import_module(f"{NAME}.steps.panel")
+    watch, clicks = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "clicks"))
+    scene.tricap.model = "auto"
+    for view in scene.tricap.views:
+        clicks.clear(view.clip)
+    path = tmp_path / "out" / "run.json"
+    run, keys = json.loads(path.read_text()), watch.refresh(scene).keys
+    run["stages"] = {stage: {**run["stages"][stage], "key": keys[stage]} for stage in ("measure", "track")}
+    run["stages"]["fit"] = {"seconds": 0.0, "key": keys["fit"], "not_done": "no clicked joints"}
+    path.write_text(json.dumps(run))
+    assert words().split()[2:6] == ["asks", "done", "done", "empty"] and watch.current(scene).next == "clicks"
+    assert "does not find the person by itself. Click at least three joints of the trunk" in why("clicks")
+    drawn = type(layout)().draw(panel.TRICAP_PT_main, blender.context)
+    assert drawn.highlighted == ["tricap.click_joints"] and "tricap.run" not in drawn.operators
+    click(blender, read_table(sample)["seeds"]["joints"])
+    assert words().split()[2:6:3] == ["done", "stale"] and watch.current(scene).can_run
+
+
 @pytest.mark.slow
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, why: Any, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
@@ -493,6 +516,20 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
     elif point == "empty":
         assert " ".join(drawn.texts).count("Save the Blender file first") == 1
         assert drawn.operators[:2] == ["tricap.load_sample", "wm.save_mainfile"]
+
+
+def test_results_that_can_hardly_be_right_are_called_doubtful(
+    blender: ModuleType, why: Any, done: Any, layout: Any, tmp_path: Path
+) -> None:
+    panel, path = importlib.import_module(f"{NAME}.steps.panel"), tmp_path / "out" / "run.json"
+    run = json.loads(path.read_text())
+    assert "doubtful " not in type(layout)().draw(panel.TRICAP_PT_main, blender.context).texts
+    run["stages"]["measure"]["residual_px"], run["stages"]["track"]["trajectories"] = 1.4, 0
+    run["stages"]["fit"]["limbs"] = {"right arm": {"guessed": 2, "seen": 1}}
+    path.write_text(json.dumps(run))
+    assert "Rays miss each other by 1.4 px" in why("surface") and why("tracks").startswith("No trajectory is left after the filters")
+    texts = type(layout)().draw(panel.TRICAP_PT_main, blender.context).texts
+    assert texts.count("doubtful ") == 3 and "Doubtful: 4 Surface, 5 Tracks, 6 Body. Unfold them for the reason." in " ".join(texts)
 
 
 def test_everything_is_offered_only_when_nothing_else_is_next(blender: ModuleType, layout: Any, sample: Path, tmp_path: Path) -> None:
