@@ -518,6 +518,16 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
         assert drawn.operators[:2] == ["tricap.load_sample", "wm.save_mainfile"]
 
 
+def test_a_view_through_the_camera_stays_there(blender: ModuleType, done: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the scene is built anew, with another camera."""
+    build = importlib.import_module(f"{NAME}.operators.build_scene")
+    areas = [area for area in blender.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D"]
+    view = areas[0].spaces.active.region_3d
+    monkeypatch.setattr(build, "_views", lambda context: [view])
+    view.view_perspective = "CAMERA"
+    assert blender.ops.tricap.build_scene() == {"FINISHED"} and view.view_perspective == "CAMERA"
+
+
 def test_results_that_can_hardly_be_right_are_called_doubtful(
     blender: ModuleType, why: Any, done: Any, layout: Any, tmp_path: Path
 ) -> None:
