@@ -60,7 +60,7 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         """In the file browser's sidebar: what to choose."""
-        sentence(self.layout, context, "Movies: select those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
+        sentence(self.layout, context, "Movies: open their folder. Select some with Shift or Ctrl, or nothing for all.", "FILE_MOVIE")
         sentence(self.layout, context, "Images: open the folder that contains a folder for each camera, and select nothing.", "FILE_IMAGE")
         if not project.bound(context.scene):
             self.layout.prop(self, "fps", text="FPS of Images")
