@@ -1,6 +1,7 @@
 """The unfolded steps: their buttons, the settings that users change often, and all other settings under Advanced."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -254,7 +255,9 @@ def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) 
     if step == "cameras":
         _section(layout, context, "bar", "Calibrate", draw_calibrate)
     if step == "retarget":
-        _section(layout, context, "onto", "Retarget to Character", draw_retarget, closed=False)
+        is_next = watch.current(context.scene).next == step
+        draw = partial(draw_retarget, is_next=is_next)
+        _section(layout, context, "onto", "Retarget to Character", draw, closed=False)
     if step == "footage":
         _section(layout, context, "where", "Advanced", _where)
     if step in states.STAGE:

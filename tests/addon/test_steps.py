@@ -512,6 +512,8 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
     assert point == "empty" or drawn.properties.count("model") == {"opened": 2, "done": 1}[point], "the body is shown before the run"
     if point == "done":
         assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
+        assert drawn.highlighted == [] and blender.ops.tricap.add_robot() == {"FINISHED"}
+        assert type(layout)().draw(panel.TRICAP_PT_main, blender.context).highlighted == ["tricap.retarget"], "once there is a target"
         assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
     elif point == "empty":
         assert " ".join(drawn.texts).count("Save the Blender file first") == 1
