@@ -2,8 +2,8 @@
 
 A track has the name of its joint ("elbow.R"); surface seeds are "seed 1", "seed 2", … Frame t of the take is frame t of the scene; a
 clip counts its own frames from 1. Disabled markers, and those that a tracker set (not keyed), are not clicks. Blender shows a marker also
-in the frames after it, and the first one before it: disabled markers next to each click end this. It cannot delete the last marker of a
-track, so a click that is removed there is disabled.
+in the frames after it, and the first one before it: disabled markers next to each click end this, except for the active track. It cannot
+delete the last marker of a track, so a click that is removed there is disabled.
 """
 
 import re
