@@ -1,8 +1,9 @@
 """Clicks: native tracking tracks in the clips of the views, one track per joint or surface seed, one marker per clicked frame.
 
 A track has the name of its joint ("elbow.R"); surface seeds are "seed 1", "seed 2", … Frame t of the take is frame t of the scene; a
-clip counts its own frames from 1. Disabled markers, and those that a tracker set (not keyed), are not clicks. Blender cannot delete the
-last marker of a track, so a click that is removed there is disabled.
+clip counts its own frames from 1. Disabled markers, and those that a tracker set (not keyed), are not clicks. Blender shows a marker also
+in the frames after it, and the first one before it: disabled markers next to each click end this, except for the active track. It cannot
+delete the last marker of a track, so a click that is removed there is disabled.
 """
 
 import re
@@ -43,9 +44,7 @@ def set_click(clip: bpy.types.MovieClip, name: str, frame: int, xy_px: tuple[flo
     u, v = axes.uv_from_pixel(np.array(xy_px, dtype=np.float64), tuple(clip.size))
     marker = track.markers.insert_frame(own, co=(float(u), float(v)))
     marker.mute = False
-    for other in list(track.markers):
-        if other.mute and other.frame != own:
-            track.markers.delete_frame(other.frame)
+    _show_in_its_frames(track)
     return track
 
 
@@ -56,10 +55,8 @@ def remove_click(clip: bpy.types.MovieClip, name: str, frame: int) -> bool:
     marker = _keyed(track, own) if track is not None else None
     if marker is None:
         return False
-    if len(track.markers) == 1:
-        marker.mute = True
-    else:
-        track.markers.delete_frame(own)
+    marker.mute = True
+    _show_in_its_frames(track)
     return True
 
 
@@ -110,6 +107,17 @@ def is_same_pixel(a: list[float], b: list[float], size_px: tuple[int, int]) -> b
     """Whether two pixels are the same marker in single precision."""
     uv = [np.float32(axes.uv_from_pixel(np.array(xy, dtype=np.float64), size_px)) for xy in (a, b)]
     return bool(np.array_equal(uv[0], uv[1]))
+
+
+def _show_in_its_frames(track: bpy.types.MovieTrackingTrack) -> None:
+    """Disable the frames next to each marker, as far as they have none, and delete all other disabled markers, but for the last one."""
+    places = {marker.frame: tuple(marker.co) for marker in track.markers if not marker.mute}
+    ends = {near: co for own, co in places.items() for near in (own - 1, own + 1) if near > 0 and near not in places}
+    for own, co in ends.items():
+        track.markers.insert_frame(own, co=co).mute = True
+    for own in [marker.frame for marker in track.markers if marker.mute and marker.frame not in ends]:
+        if len(track.markers) > 1:
+            track.markers.delete_frame(own)
 
 
 def _tracks(clip: bpy.types.MovieClip) -> Iterator[bpy.types.MovieTrackingTrack]:

@@ -113,9 +113,12 @@ class ClickSession:
         self._put({view: xy_px})
 
     def accept(self) -> None:
-        """Accept all proposals and go to the next joint."""
+        """Accept all proposals and go to the next joint; views that do not show the joint have no proposal."""
         if self.name and self.proposals:
+            name = self.name
             self._put({view: offer.xy_px for view, offer in self.proposals.items()})
+            if self.name == name:
+                self.go_to_next(self.index + 1)
         elif self.name:
             self._leave(on_purpose=False)
 

@@ -1,5 +1,6 @@
 """Draws over the footage while clicking: the name at the mouse, the figure, epipolar lines, and proposals."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -85,7 +86,8 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
         canvas.draw_lines(canvas.line_batch(parts), 2.0, OFFER)
         canvas.text(f"{session.name}? ±{max(offer.sigma_px, 0.1):.1f} px", centre[0] + OFFER_PX + 6, centre[1] - 20, OFFER, size=11)
     _draw_headline(session, view, sheet)
-    draw_figure(session, sheet)
+    here = [at, offer.xy_px if offer is not None else None]
+    draw_figure(session, sheet, [np.array([x, y]), *(sheet.to_region(xy) for xy in here if xy is not None)])
     if session.name and 0 <= x < sheet.region.width and 0 <= y < sheet.region.height:
         canvas.text(session.name, x + 16, y + 10, CURRENT, size=15)
 
@@ -145,16 +147,25 @@ def _left(sheet: Canvas) -> float:
     return float(sum(r.width for r in tools if r.x < sheet.region.x + r.width))
 
 
-def draw_figure(session: ClickSession, sheet: Canvas) -> None:
-    """The figure in the lower left corner: the current joint has a ring, clicked ones are green."""
+def _right(sheet: Canvas) -> float:
+    """Width of the sidebar, which covers the right of the region."""
+    sides = [r for r in bpy.context.area.regions if r.type == "UI" and r.width > 1] if bpy.context.area else []
+    return float(sum(r.width for r in sides if r.x < sheet.region.x + sheet.region.width))
+
+
+def draw_figure(session: ClickSession, sheet: Canvas, places: Sequence[np.ndarray] = ()) -> None:
+    """The figure in the lower left corner, or in the right one while it would cover one of these places (2,): the current joint has a
+    ring, clicked ones are green."""
     shape, scale = figure(), bpy.context.preferences.system.ui_scale
     size = min(FIGURE_PX * scale, 0.4 * sheet.region.height)
     drawn = [name for name in session.names if name in shape.joints]
     if not drawn or size < 60:
         return
-    corner = np.array([MARGIN_PX * scale + _left(sheet), (MARGIN_PX + TIMELINE_PX) * scale])
     width, foot = shape.width * size + 24 * scale, 18 * scale
-    canvas.fill(canvas.rectangle(corner[0], corner[1], width, size + foot + 12 * scale), BACKING)
+    extent, y = np.array([width, size + foot + 12 * scale]), (MARGIN_PX + TIMELINE_PX) * scale
+    left, right = MARGIN_PX * scale + _left(sheet), sheet.region.width - MARGIN_PX * scale - _right(sheet) - width
+    corner = clear_corner(left, right, y, extent, places)
+    canvas.fill(canvas.rectangle(*corner, *extent), BACKING)
     base = corner + (12 * scale, foot + 4 * scale)
     canvas.fill(base + size * shape.triangles, BODY)
     for name in drawn:
@@ -166,6 +177,14 @@ def draw_figure(session: ClickSession, sheet: Canvas) -> None:
         canvas.draw_lines(canvas.line_batch(canvas.ring(at, 9 * scale)), 2.5, CURRENT)
     canvas.text("R", base[0], corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
     canvas.text("L", base[0] + shape.width * size - 8 * scale, corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
+
+
+def clear_corner(left: float, right: float, y: float, extent: np.ndarray, places: Sequence[np.ndarray]) -> np.ndarray:
+    """The lower left corner (2,) of a box of this extent (2,) at the left, or at the right if one of the places (2,) is under the left one
+    and none under the right one."""
+    corners = [np.array([x, y]) for x in (left, right)]
+    free = [not any(((place >= corner) & (place <= corner + extent)).all() for place in places) for corner in corners]
+    return corners[1] if free == [False, True] else corners[0]
 
 
 def _dot(centre: np.ndarray, radius: float, corners: int = 12) -> np.ndarray:

@@ -8,11 +8,13 @@ import numpy as np
 
 from ...core.foundation.progress import Monitor
 from .. import project
-from ..editing.curves import replace_keys
+from ..editing import uncertainty
+from ..editing.curves import replace_keys, sigma_curves
 from ..operators.stages import Fit, StageOperator, run_and_read
 from ..overlay import canvas, results
 from ..retarget import base_layer
 from ..scene import stored
+from ..scene.action import place_sigmas
 from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
 from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, controls_of_body, curves_of
 
@@ -53,9 +55,11 @@ class FitAgain(StageOperator, bpy.types.Operator):
             return super().finish(context, result)
         for body in all_bodies(context.scene):
             move_keys(body, result)
+            renew_sigmas(body, result)
         for body, rig in _controlled(context.scene):
             base_layer.bake_again(rig, body, result.frames)
         results.clear()
+        uncertainty.forget()
         _mark_again(context.scene)
         canvas.redraw_clips(context)
         context.scene.frame_set(context.scene.frame_current)
@@ -83,8 +87,7 @@ def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
     """Add what the new fit changed to the actions of a body: the measured one, and the edited one with its edits."""
     from ..scene.armature import channel_of
 
-    pose, none = "T" if body.data.get(REST_POSE_KEY) == "T" else "A", np.zeros_like(again.before)
-    before, after = (with_rest_pose(again.shape, values, none, pose)[1] for values in (again.before, again.after))
+    before, after = (with_rest_pose(again.shape, values, again.sigma, _pose_of(body))[1] for values in (again.before, again.after))
     change = {name: column for name, column in zip(again.dof_names, (after - before).T) if np.abs(column).max() > 0}
     lift_m = stored.number(body.data, LIFT_KEY)
     stand = Standing(lift_m=lift_m, floor_m=body.location.z) if lift_m is not None else None
@@ -96,6 +99,21 @@ def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
         if (curve.data_path, curve.array_index) in moved:
             before = np.array([curve.evaluate(frame) for frame in again.frames])
             replace_keys(curve, again.frames, before + moved[curve.data_path, curve.array_index])
+
+
+def renew_sigmas(body: bpy.types.Object, again: "FittedAgain") -> None:
+    """Give the sigmas of a body, those of its angles and of the places of its bones, the values of the new fit in its frames."""
+    shape, _, sigma = with_rest_pose(again.shape, again.after, again.sigma, _pose_of(body))
+    new = dict(zip(again.dof_names, sigma.T)) | place_sigmas(shape, again.joints, again.frames)
+    for name, curve in sigma_curves(body).items():
+        values = new.get(name.removeprefix("sigma "))
+        if values is not None:
+            replace_keys(curve, again.frames, values)
+
+
+def _pose_of(body: bpy.types.Object) -> str:
+    """The rest pose with which a body was built."""
+    return "T" if body.data.get(REST_POSE_KEY) == "T" else "A"
 
 
 CLASSES = (FitAgain,)

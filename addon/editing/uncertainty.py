@@ -16,6 +16,7 @@ from ..session import get_session
 from .curves import keys_of, sigma_curves
 
 STRIP_PX, RULER_PX, OPACITY, BONE_PX = 11.0, 26.0, 0.9, 6.0  # the ruler with the frames stays free
+NAME_PX, NAME_GAP_PX = 9.0, 4.0
 LEGEND_PX, MARGIN_PX, SHADES = 150.0, 14.0, 48
 HIGH_PX = 160.0  # an editor in which there is room for a legend over the strips
 TITLE = "Sigma of the joints"
@@ -87,6 +88,12 @@ def redraw(context: bpy.types.Context) -> None:
                 area.tag_redraw()
 
 
+def forget() -> None:
+    """Read the sigmas again when they are shown next: they have changed."""
+    get_session().file.uncertainty = ((), None)
+    redraw(bpy.context)
+
+
 def _shown() -> tuple[bpy.types.Object, Sigmas] | None:
     """The body whose uncertainty is shown, and its sigmas, which are read once."""
     scene = bpy.context.scene
@@ -110,9 +117,11 @@ def _draw_strip() -> None:
     body, sigmas = found
     scale, y = bpy.context.preferences.system.ui_scale, 0.0
     most = int((region.height / scale - RULER_PX) // STRIP_PX)
+    playhead = region.view2d.view_to_region(bpy.context.scene.frame_current_final, 0.0, clip=False)[0]
     for name, bones in strips(body, sigmas, chosen_bones(body), most).items():
         _draw_row(region, *of_frames(sigmas, bones), y, (STRIP_PX - 1.0) * scale)
-        canvas.text(name, 4 * scale, y + 1.5 * scale, size=9)
+        width = canvas.text_width(name, size=NAME_PX)
+        canvas.text(name, name_x(width, playhead, NAME_GAP_PX * scale), y + 1.5 * scale, size=NAME_PX)
         y += STRIP_PX * scale
     if not sigmas:
         canvas.text(LACKING, MARGIN_PX * scale, 4 * scale, size=11)
@@ -128,6 +137,11 @@ def _draw_row(region: bpy.types.Region, frames: np.ndarray, sigma_mm: np.ndarray
     pixels = region.width / (right - left)
     boxes = np.concatenate([canvas.rectangle((frame - 0.5 - left) * pixels, y, max(pixels, 1.0), height) for frame in frames[seen]])
     canvas.fill_each(boxes, np.repeat(colour_of(sigma_mm[seen]), 2, axis=0))
+
+
+def name_x(width: float, playhead: float, gap: float) -> float:
+    """Where a strip's name begins: at the left edge, or right of the playhead if that would lie over it."""
+    return playhead + gap if 0.0 <= playhead <= gap + width + gap else gap
 
 
 def chosen_bones(body: bpy.types.Object) -> set[str]:

@@ -131,10 +131,12 @@ def put_into_scene(
     blend: Path | None = None,
     options: SceneOptions = DEFAULTS,
 ) -> None:
-    """Build the scene and report its contents; the first time, frame the body in the 3-D views."""
+    """Build the scene and report its contents; the first time, frame the body in the 3-D views. Else those that look through the camera
+    still do, though it is another one."""
     from ..scene.build import write_scene
 
     first = armature.NAME not in bpy.data.objects
+    through = [view for view in _views(context) if view.view_perspective == "CAMERA"]
     report_scene(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
     chosen = context.scene.tricap_retarget
@@ -142,6 +144,14 @@ def put_into_scene(
         chosen.source, chosen.export = chosen.source or body, chosen.export or body
     if first and body is not None:
         frame_in_views(operator, context, body)
+    else:
+        look_through_camera(context, through)
+
+
+def look_through_camera(context: bpy.types.Context, views: list[bpy.types.RegionView3D]) -> None:
+    """Let 3-D views look through the scene's camera: that of an earlier build is gone, and their view with it."""
+    for view in views if context.scene.camera is not None else ():
+        view.view_perspective = "CAMERA"
 
 
 def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, contents: "Contents") -> None:
@@ -162,8 +172,7 @@ def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, conten
     write_scene(replace(contents, warnings=(), shape=None, motion=None), options=replace(DEFAULTS, studio=False))
     if first and views:
         hide_default_objects(operator, context)
-    for view in through if context.scene.camera is not None else ():  # the cameras of an earlier build are gone, and their view with them
-        view.view_perspective = "CAMERA"
+    look_through_camera(context, through)
 
 
 def _views(context: bpy.types.Context) -> list[bpy.types.RegionView3D]:

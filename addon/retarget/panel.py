@@ -50,8 +50,8 @@ def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
         sentence(layout, bpy.context, line, "INFO")
 
 
-def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Source, target, mapping, settings, buttons."""
+def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context, *, is_next: bool = False) -> None:
+    """Source, target, mapping, settings, buttons; *Retarget* is highlighted if it is next and there is a target."""
     props = context.scene.tricap_retarget
     column = layout.column()
     column.prop(props, "source")
@@ -85,7 +85,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     buttons = layout.row(align=True)
     buttons.scale_y = 1.3
     buttons.enabled = target is not None and (props.source is not None or bool(props.file))
-    buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
+    buttons.operator("tricap.retarget", icon="ARMATURE_DATA", depress=is_next and target is not None)
     buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
     if bpy.data.collections.get(preview.NAME) is not None:
         buttons.operator("tricap.retarget_end_preview", text="", icon="X")

@@ -1,6 +1,7 @@
 """The unfolded steps: their buttons, the settings that users change often, and all other settings under Advanced."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -164,12 +165,12 @@ def _clicks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
 
 def surface(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Measure the surface."""
-    _stage(layout, context, "surface", "tricap.measure", is_next, icon="POINTCLOUD_DATA")
+    _stage(layout, context, "surface", "tricap.measure", icon="POINTCLOUD_DATA")
 
 
 def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Track points."""
-    _stage(layout, context, "tracks", "tricap.track", is_next, icon="CURVE_PATH")
+    _stage(layout, context, "tracks", "tricap.track", icon="CURVE_PATH")
 
 
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
@@ -179,14 +180,15 @@ def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) 
         button = primary(layout, "tricap.click_joints", True, icon="RESTRICT_SELECT_OFF", text=f"Click {asked[0]} in Frame {asked[1]}")
         button.needed, button.frame = asked
         sentence(layout, context, "After it you may click more joints. With three of shoulders and hips, the fit asks no more.", "INFO")
-    _stage(layout, context, "body", "tricap.fit", is_next and asked is None, icon="ARMATURE_DATA")
+    _stage(layout, context, "body", "tricap.fit", icon="ARMATURE_DATA")
     if watch.current(context.scene).states["body"].status in (Status.DONE, Status.STALE):
         offer(layout, "tricap.review", icon="VIEWZOOM")
         layout.operator("tricap.open_report", icon="TEXT")
     draw_dofs(layout, context.scene)
 
 
-def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, is_next: bool, icon: str) -> None:
+def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, icon: str) -> None:
+    """The settings that users change often, and the button of this step alone; the one for all remaining steps is at the top."""
     now = watch.current(context.scene).states
     column = layout.column()
     column.use_property_split = False  # leaves the full width for their names
@@ -194,7 +196,7 @@ def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, op
         column.prop(getattr(context.scene.tricap, group), name)
     row = layout.column()
     row.enabled = now["cameras"].status == Status.DONE
-    primary(row, operator, is_next, icon=icon)
+    row.operator(operator, icon=icon)
     if now[step].status in (Status.DONE, Status.STALE):
         layout.operator("tricap.open_views", icon="SEQUENCE", text="Show over Footage").show = SHOWS[step]
 
@@ -253,7 +255,9 @@ def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) 
     if step == "cameras":
         _section(layout, context, "bar", "Calibrate", draw_calibrate)
     if step == "retarget":
-        _section(layout, context, "onto", "Retarget to Character", draw_retarget, closed=False)
+        is_next = watch.current(context.scene).next == step
+        draw = partial(draw_retarget, is_next=is_next)
+        _section(layout, context, "onto", "Retarget to Character", draw, closed=False)
     if step == "footage":
         _section(layout, context, "where", "Advanced", _where)
     if step in states.STAGE:

@@ -31,9 +31,11 @@ class CamerasFromFile(SimpleOperator, ImportHelper, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Read it and save a copy as rig.toml in the project."""
+        before = [view.name for view in context.scene.tricap.views]
         said = use_file(context.scene, folders.absolute(self.filepath))
         show_cameras(self, context)
-        return said
+        now = [view.name for view in context.scene.tricap.views]
+        return said + (f" As they stand, from left to right: {', '.join(now)}." if now != before else "")
 
 
 class CamerasFromScene(SimpleOperator, bpy.types.Operator):
@@ -58,12 +60,9 @@ def use_file(scene: bpy.types.Scene, path: Path) -> str:
     """
     rig = read_any(path)
     bar, names = read_bar(path, rig), names_for_views(rig, [view.name for view in scene.tricap.views])
-    before = [view.name for view in scene.tricap.views]
     use_rig(scene, renamed(rig, names), bar)
-    now = [view.name for view in scene.tricap.views]
-    moved = f" As they stand, from left to right: {', '.join(now)}." if now != before else ""
-    matched = "".join(f" Camera {camera} is view {view}." for camera, view in names.items())
-    return f"{len(rig.cameras)} cameras from {path.name}.{matched}{' Correct the names if that is wrong.' if names else ''}{moved}"
+    matched = ", ".join(f"{camera} is view {view}" for camera, view in names.items())
+    return f"{len(rig.cameras)} cameras from {path.name}.{f' Camera {matched}. Correct the names if that is wrong.' if matched else ''}"
 
 
 def use_calibration_in(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> str:

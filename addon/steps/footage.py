@@ -60,10 +60,10 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         """In the file browser's sidebar: what to choose."""
-        sentence(self.layout, context, "Movies: select those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
+        sentence(self.layout, context, "Movies: open their folder. Select some with Shift or Ctrl, or nothing for all.", "FILE_MOVIE")
         sentence(self.layout, context, "Images: open the folder that contains a folder for each camera, and select nothing.", "FILE_IMAGE")
         if not project.bound(context.scene):
-            self.layout.prop(self, "fps")
+            self.layout.prop(self, "fps", text="FPS of Images")
 
     def do(self, context: bpy.types.Context) -> str:
         """Link the footage into the project and show it as clips; from a take also its values."""
@@ -72,7 +72,9 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
         if not project.bound(scene) and take_files(place, names):
             return self._add_take(scene, place, fps)
         said = self._add_files(scene, place, names, fps)
-        return f"{said}{use_calibration_in(self, context, place)}"
+        cameras = use_calibration_in(self, context, place)
+        order = ", ".join(view.name for view in scene.tricap.views)
+        return f"{said}, from left to right: {order}. If that is wrong, correct it in step 1.{cameras}"
 
     def _add_take(self, scene: bpy.types.Scene, place: Path, fps: float) -> str:
         """Link the footage of a take; copy its take.toml and cameras."""
@@ -106,9 +108,8 @@ class AddFootage(SimpleOperator, bpy.types.Operator):
             use_common_frames(scene, folder)
         if len(entries) > 1:
             project.write(scene)
-        names = ", ".join(entry["name"] for entry, _ in made)
         rate = f"{round(scene.tricap.fps, 3):g} fps{' (assumed: images state none)' if is_rate_assumed(scene) else ''}"
-        return f"{len(made)} views added, {rate}, from left to right: {names}. If that is wrong, correct it in step 1."
+        return f"{len(made)} views added, {rate}"
 
 
 class OpenTake(SimpleOperator, bpy.types.Operator):

@@ -59,7 +59,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         is_next = step == now.next and state.status in (Status.READY, Status.EMPTY)
         header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS[Status.READY if is_next else state.status])
         right = header.row()
-        doubtful = step == "cameras" and check.is_doubtful(context.scene)
+        doubtful = state.doubtful or (step == "cameras" and check.is_doubtful(context.scene))
         right.alignment, right.alert = "RIGHT", doubtful or state.status in (Status.FAILED, Status.STALE)
         right.label(text=f"{'next' if is_next else 'doubtful' if doubtful else LABELS[state.status]} ")
         if body is None:
@@ -99,6 +99,12 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         number = STEPS.index(now.next)
         plays = ". Press Space to play the motion." if now.next == STEPS[-1] else ""
         sentence(box, context, f"Next: {number + 1} {TITLES[number]}{plays}", "FORWARD")
+    if doubtful := [f"{n} {title}" for n, (step, title) in enumerate(zip(STEPS, TITLES), 1) if now.states[step].doubtful]:
+        rows = box.column()
+        rows.alert = True
+        sentence(
+            rows, context, f"Doubtful: {', '.join(doubtful)}. Unfold {'it' if len(doubtful) == 1 else 'them'} for the reason.", "ERROR"
+        )
     if now.next == "surface":  # seen before the run: steps 1 and 3 may be done and folded
         if is_rate_assumed(context.scene):
             row = box.row()
@@ -106,7 +112,7 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             row.prop(context.scene.tricap, "fps", text="FPS of the Images")
         box.prop(context.scene.tricap, "model", text="Body")
     if now.can_run:
-        box.operator("tricap.run", icon="FF", text="Run Remaining Steps")
+        bodies.primary(box, "tricap.run", True, icon="FF", text="Run Remaining Steps")
     if is_sample(context.scene):
         box.operator("tricap.compute_sample", icon="FILE_REFRESH")
 

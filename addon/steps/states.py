@@ -35,6 +35,7 @@ STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
 SAVE_FIRST = "Save the Blender file first: the project folder is created next to it. Then add the footage of your cameras."
 OUTDATED = "Inputs have changed since this step ran. Run it again."
+DOUBTFUL_SHARE = 0.5  # of the frames: a body of which a limb is guessed in more
 NEEDED_JOINTS = 2  # the fewest that the fit accepts
 CACHED_CLICKS = 500  # joints whose clicks are remembered as checked
 CACHED_SEQUENCES = 50
@@ -77,6 +78,7 @@ class State:
     message: str = ""
     fix: Fix | None = None
     click: tuple[str, int] | None = None  # the joint and the frame whose click the fit asks for
+    doubtful: bool = False  # done, but what it found can hardly be right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +113,8 @@ class _Project:
     run: Mapping[str, Any] | None = None
     problem: str = ""  # why run.json cannot be read
     out: Path | None = None
+    frames_again: str = ""  # fitted again to the clicks as they are now
+    nobody_found: bool = False  # by the fit, which began without clicks
 
 
 def compute(scene: bpy.types.Scene) -> StepStates:
@@ -124,6 +128,8 @@ def compute(scene: bpy.types.Scene) -> StepStates:
     found.keys = _or_none(lambda: _keys(found))
     for step in STAGE:
         states[step] = _stage(step, states, found)
+    if found.nobody_found and states["clicks"].status == Status.DONE:
+        states["clicks"] = State(status=Status.ASKS, message=_where_to_click(found))
     states["rig"] = _rig(scene, states, found)
     states["retarget"] = _retarget(scene, states["rig"])
     return StepStates(states=states, keys=found.keys or {})
@@ -277,13 +283,24 @@ def _stage(step: str, states: Mapping[str, State], found: _Project) -> State:
         before = states[STEPS[STEPS.index(step) - 1]].status if step != "surface" else Status.DONE
         return State(status=Status.READY if before == Status.DONE else Status.EMPTY, message=_READY[step])
     if entry.get("key") != found.keys[stage]:
-        return State(status=Status.STALE, message=OUTDATED)
+        found.frames_again = _frames_again(found, entry) if step == "body" else ""
+        again = f"Frames {found.frames_again} were fitted again to your clicks. Fit Body also adjusts the shape and all other frames."
+        return State(status=Status.STALE, message=again if found.frames_again else OUTDATED)
     if "not_done" in entry and step != "body":
         return State(status=Status.DONE, message=f"Skipped: {entry['not_done']}.")
     if "not_done" in entry:
-        status = Status.READY if states["clicks"].status == Status.DONE else Status.EMPTY
-        return State(status=status, message=f"No body was fitted: {entry['not_done']}.")
-    return State(status=Status.DONE, message=_figures(step, entry))
+        found.nobody_found = True
+        return State(status=Status.EMPTY, message=f"No body was fitted: {entry['not_done']}. Click joints first (step 3).")
+    return State(status=Status.DONE, message=_figures(step, entry), doubtful=_is_doubtful(step, entry))
+
+
+def _frames_again(found: _Project, fit: Mapping[str, Any]) -> str:
+    """The frames that *Fit Again* fitted to the clicks as they are now, in words; "" if more than these clicks has changed."""
+    if not fit.get("fitted_again") or found.footage is None or found.take is None or found.out is None:
+        return ""
+    from ...core.run.around_clicks import frames_again
+
+    return frames_again(fit, found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 
 _READY = {
@@ -293,13 +310,33 @@ _READY = {
 }
 
 
+def _where_to_click(found: _Project) -> str:
+    """What to click where the fit does not find the person."""
+    whole = found.take is not None and found.take.body_model in START_ALONE
+    what = "three joints of the trunk (shoulders, hips, neck, pelvis)" if whole else "two joints of the limb"
+    other = ", or choose the limb that is filmed as Body and click its joints" if whole else ""
+    return f"The fit does not find the person by itself. Click at least {what} in two views each{other}; then run the fit again."
+
+
+def _is_doubtful(step: str, entry: Mapping[str, Any]) -> bool:
+    """Whether a stage ended with figures that can hardly be right."""
+    from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
+
+    if step == "surface":
+        return bool(entry["residual_px"] > DOUBTFUL_RESIDUAL_PX)
+    if step == "tracks":
+        return bool(entry["trajectories"] == 0)
+    guessed = max((counts.get(GUESSED, 0) for counts in entry.get("limbs", {}).values()), default=0)
+    return bool(guessed > DOUBTFUL_SHARE * sum(entry["frames"].values()))
+
+
 def _figures(step: str, entry: Mapping[str, Any]) -> str:
     if step == "surface":
-        from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
-
         doubt = " Rays miss each other by {:.1f} px: check the cameras, the offsets, and whether views are swapped."
-        missed = doubt.format(entry["residual_px"]) if entry["residual_px"] > DOUBTFUL_RESIDUAL_PX else ""
+        missed = doubt.format(entry["residual_px"]) if _is_doubtful(step, entry) else ""
         return f"{entry['points_per_frame']:.0f} points per frame, accurate to {entry['sigma_mm']:.2f} mm (1 sigma).{missed}"
+    if step == "tracks" and _is_doubtful(step, entry):
+        return "No trajectory is left after the filters: is there enough texture, and is the surface right?"
     if step == "tracks":
         return f"{entry['trajectories']} trajectories, {entry['mean_length_frames']:.0f} frames long on average."
     text = f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
@@ -325,7 +362,9 @@ def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -
         return State(status=Status.STALE, message="The body's armature is missing from the scene. Build it again.")
     now = found.keys or {}
     if found.keys is not None and any(now.get(stage) != key for stage, key in stored.table(built, KEYS_KEY).items()):
-        return State(status=Status.STALE, message="The scene shows an earlier result. Run the steps before, then build it again.")
+        again = f"The scene plays frames {found.frames_again} as they were fitted again. After Fit Body, build it again."
+        earlier = "The scene shows an earlier result. Run the steps before, then build it again."
+        return State(status=Status.STALE, message=again if found.frames_again else earlier)
     if found.keys is not None and lacks_results(built, found):
         return State(status=Status.STALE, message="There are results that the scene does not show yet. Build it again.")
     return State(status=Status.DONE, message="The armature plays the motion." if moving else "Surface and tracks are in the scene.")

@@ -78,6 +78,11 @@ def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
             not isinstance(words, dict) or any(not is_figure(n) for n in words.values()) for words in limbs.values()
         ):
             return stage
+        again = entry.get("fitted_again", []) if stage == "fit" else []
+        if not isinstance(again, list) or any(not isinstance(ends, list) or [type(f) for f in ends] != [int, int] for ends in again):
+            return stage
+        if not isinstance(entry.get("fitted_with", {}), dict):
+            return stage
     return None
 
 

@@ -52,13 +52,16 @@ AGAIN = "fitted_again"  # entry of the fit in run.json: first and last frames th
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedAgain:
-    """What a new fit around some clicks changed: n frames, in them the D degrees of freedom before and after [rad, m]."""
+    """What a new fit around some clicks changed: n frames, in them D degrees of freedom before and after [rad, m] with their new sigmas,
+    and the joints of all frames."""
 
     shape: BodyShape
     frames: np.ndarray  # (n,)
     dof_names: tuple[str, ...]
     before: np.ndarray  # (n, D)
     after: np.ndarray  # (n, D)
+    sigma: np.ndarray  # (n, D)
+    joints: JointTable
 
     def __str__(self) -> str:
         return f"Frames {frame_list(self.frames.tolist())} were fitted again, with the shape as it was. Fit Body also adjusts the shape."
@@ -78,6 +81,15 @@ def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, sta
     """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file."""
     take = replace(footage.take, clicks=replace(footage.take.clicks, joints={}), keyframes=())
     return stage_keys(replace(footage, take=take), settings, out, stamp)["fit"]
+
+
+def frames_again(fit: Mapping[str, Any], footage: Footage, settings: Mapping[str, Any], out: Path) -> str:
+    """The frames, in words, that were fitted again to the clicks as they are now, by the entry of the fit in run.json; "" if anything has
+    changed since."""
+    before = fit.get(FITTED_WITH, {})
+    if not fit.get(AGAIN) or {**before, **fitted_with(footage, settings, out)} != before:
+        return ""
+    return ", ".join(f"{first}–{last}" if first != last else f"{first}" for first, last in fit[AGAIN])
 
 
 def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monitor: Monitor) -> FittedAgain | None:
@@ -116,12 +128,17 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
         record["stages"]["fit"] |= {FITTED_WITH: {**before, **now}, AGAIN: again}
         results.write_run(record)
+        written = _Body.read(results, body.model)
+    frames = np.concatenate([part.frames for part in parts])
+    fitted = np.isin(body.motion.frames, frames)
     return FittedAgain(
         shape=body.shape,
-        frames=np.concatenate([part.frames for part in parts]),
+        frames=frames,
         dof_names=body.motion.dof_names,
-        before=body.motion.values[np.isin(body.motion.frames, np.concatenate([part.frames for part in parts]))],
+        before=body.motion.values[fitted],
         after=np.concatenate([part.values for part in parts]),
+        sigma=written.motion.sigma[fitted],
+        joints=written.joints,
     )
 
 

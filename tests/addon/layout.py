@@ -5,11 +5,13 @@ from typing import Any
 
 
 class Layout:
-    """Records texts, operators and properties; sub-layouts record into the same lists. Every section is unfolded."""
+    """Records texts, operators, which of them are highlighted, and properties; sub-layouts record into the same lists. Every section is
+    unfolded."""
 
     def __init__(self, root: "Layout | None" = None) -> None:
         self.__dict__["texts"] = root.texts if root else []
         self.__dict__["operators"] = root.operators if root else []
+        self.__dict__["highlighted"] = root.highlighted if root else []
         self.__dict__["properties"] = root.properties if root else []
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -49,6 +51,8 @@ class Layout:
         space, _, verb = name.partition(".")
         getattr(getattr(bpy.ops, space), verb).get_rna_type()
         self.operators.append(name)
+        if words.get("depress"):
+            self.highlighted.append(name)
         return SimpleNamespace()
 
     def operator_menu_enum(self, name: str, prop: str, **words: Any) -> Any:

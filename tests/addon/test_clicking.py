@@ -103,6 +103,26 @@ def test_return_takes_the_proposals_and_goes_on(session: Any, truth: Truth, scen
     assert set(table["seeds"]["joints"]["shoulder.R"]) == {"L", "C", "R"} and table["seeds"]["frame"] == 0
 
 
+def test_return_goes_on_though_a_view_does_not_show_the_joint(session: Any, truth: Truth) -> None:
+    camera = dict(zip(session.views, session.finder.cameras))
+    session.click("C", camera["C"].project(truth.joints_m["RightArm"][0]))
+    assert session.take_answer(session.finder.wait()) and set(session.proposals) == {"L", "R"}
+    del session.proposals["R"]
+    session.accept()
+    assert session.name == "elbow.R" and set(session.clicks("shoulder.R")) == {"L", "C"}
+    assert session.back() and session.name == "shoulder.R" and set(session.clicks()) == {"C"}
+
+
+def test_the_figure_makes_room_for_what_is_under_it() -> None:
+    draw = module("clicking.draw")
+    extent, under_left, under_right = np.array([120.0, 190.0]), np.array([60.0, 100.0]), np.array([750.0, 100.0])
+
+    def x(*places: np.ndarray) -> float:
+        return float(draw.clear_corner(12.0, 668.0, 34.0, extent, places)[0])
+
+    assert x() == x(np.array([400.0, 100.0])) == x(under_left, under_right) == 12.0 and x(under_left) == 668.0
+
+
 def test_skip_back_and_undo(session: Any) -> None:
     session.skip()
     assert session.name == "elbow.R" and not session.changed

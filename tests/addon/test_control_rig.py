@@ -14,6 +14,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.geometry.rotation import angle_of, transposed, twist_about
 from tricap.core.motion.formats.bvh import read_bvh
+from tricap.core.motion.tables import JointTable
 
 from .test_scene_standing import FRAMES, walk, walker
 
@@ -297,10 +298,11 @@ def test_the_uncertainty_is_shown_where_the_controls_are(blender: ModuleType) ->
 
 BUMP = np.array([0.0, 0.3, 0.6, 0.2])  # radians, in the frames from 4 on
 PULLED = {"shoulder.L flexion": 1.0, "elbow.L flexion": 1.0, "hip.R flexion": -0.5, "pelvis z": 0.05}
+LEAST_KNOWN_M, DOF_SIGMA = 0.04, 0.02  # of the wrist and of every degree of freedom in these frames
 
 
 def fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let Fit Again, without a take, change the frames from 4 to 7 by BUMP."""
+    """Let Fit Again, without a take, change the frames from 4 to 7 by BUMP, and their sigmas."""
     around, again = (
         importlib.import_module(f"bl_ext.user_default.tricap.{name}") for name in ("core.run.around_clicks", "addon.correcting.fit_again")
     )
@@ -310,9 +312,47 @@ def fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
     names = list(shape.skeleton.dof_names)
     for name, part in PULLED.items():
         after[:, names.index(name)] += part * BUMP
-    found = around.FittedAgain(shape=shape, frames=np.arange(4, 8), dof_names=tuple(names), before=before, after=after)
+    found = around.FittedAgain(
+        shape=shape,
+        frames=np.arange(4, 8),
+        dof_names=tuple(names),
+        before=before,
+        after=after,
+        sigma=np.full(after.shape, DOF_SIGMA),
+        joints=joints_of(shape),
+    )
     monkeypatch.setattr(again.project, "chosen", lambda scene, take, out: (Path(), Path(), {}))
     monkeypatch.setattr(around, "fit_around_clicks", lambda *_: found)
+
+
+def joints_of(shape: Any) -> JointTable:
+    """All joints as well known as the walker's, but for the left wrist."""
+    sigma = {name: np.full(FRAMES, LEAST_KNOWN_M if name == "wrist.L" else 0.003) for name in shape.skeleton.joint_names}
+    return JointTable(
+        frames=np.arange(FRAMES),
+        time_s=np.zeros(FRAMES),
+        joints_m={name: np.zeros((FRAMES, 3)) for name in sigma},
+        sigma_m=sigma,
+        frame_sigma_m=sigma,
+        known={name: ("seen",) * FRAMES for name in sigma},
+    )
+
+
+def test_frames_that_are_fitted_again_have_the_new_sigmas(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while the uncertainty is shown, for which they have been read."""
+    fitted_again(monkeypatch)
+    body, scene = walker(blender), blender.context.scene
+    editing = "bl_ext.user_default.tricap.addon.editing"
+    uncertainty, curves = (importlib.import_module(f"{editing}.{name}") for name in ("uncertainty", "curves"))
+    scene.tricap.show_uncertainty = True
+    assert uncertainty._shown()[1]["forearm.L"][1] == pytest.approx(np.full(FRAMES, 3.0))
+    assert blender.ops.tricap.fit_again() == {"FINISHED"}
+    wanted = np.full(FRAMES, 3.0)
+    wanted[4:8] = 1e3 * LEAST_KNOWN_M
+    shown = uncertainty._shown()[1]
+    assert shown["forearm.L"][1] == pytest.approx(wanted) and shown["thigh.L"][1] == pytest.approx(np.full(FRAMES, 3.0))
+    _, angle = curves.keys_of(curves.sigma_curves(body)["sigma elbow.L flexion"])
+    assert angle == pytest.approx(np.where(np.isin(np.arange(FRAMES), range(4, 8)), DOF_SIGMA, 0.01))
 
 
 @pytest.mark.parametrize("path", ["BONE", "OBJECT"])

@@ -145,6 +145,8 @@ def test_the_strips_show_how_well_trunk_and_limbs_are_known(blender: ModuleType)
     assert uncertainty.strips(body, sigmas, {"forearm.R", "root"}, 1) == {"Selected bones": ["forearm.R"]}
     ((name, every),) = uncertainty.strips(body, sigmas, set(), 4).items()
     assert name == "Least known" and set(every) == set(sigmas), "in a low timeline there is room for one strip only"
+    assert uncertainty.name_x(60.0, 36.0, 4.0) == 40.0, "right of the playhead that would cross it"
+    assert uncertainty.name_x(60.0, 300.0, 4.0) == uncertainty.name_x(60.0, -9.0, 4.0) == 4.0
     frames, sigma = uncertainty.of_frames(sigmas, {"forearm.R"})
     assert list(frames) == list(range(FRAMES)) and sigma[NOISY.start] == pytest.approx(1e3 * LOST_M)
     blue, red = uncertainty.colour_of(np.array([0.5, 80.0]))[:, :3]

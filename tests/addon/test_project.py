@@ -73,7 +73,31 @@ def test_clicks_lie_where_the_image_shows_them(project: ModuleType, clicks: Modu
     assert clicks.remove_click(clip, "elbow.R", 6) and len(clip.tracking.tracks["elbow.R"].markers) == 1, "the last one is only disabled"
     assert clicks.get_click(clip, "elbow.R", 6) is None and clicks.clicked_frames(clip) == {3}
     clicks.set_click(clip, "elbow.R", 4, (1.0, 2.0))
-    assert [(m.frame, m.mute) for m in clip.tracking.tracks["elbow.R"].markers] == [(7, False)]
+    assert [(m.frame, m.mute) for m in clip.tracking.tracks["elbow.R"].markers] == [(6, True), (7, False), (8, True)]
+
+
+def test_clicks_are_shown_in_their_frames_alone(project: ModuleType, clicks: ModuleType, blender: ModuleType, take: Path) -> None:
+    """Blender draws the marker that `find_frame` finds, unless it is disabled."""
+    project.open_take(blender.context.scene, take)
+    clip = project.clips_of(blender.context.scene)["L"]
+    clicks.clear(clip)
+
+    def shown() -> list[int]:
+        markers = clip.tracking.tracks["elbow.R"].markers
+        return [frame for frame in range(-2, 9) if not markers.find_frame(clicks.clip_frame(clip, frame), exact=False).mute]
+
+    for frames, change in (
+        ([3], lambda: clicks.set_click(clip, "elbow.R", 3, (62.0, 81.0))),
+        ([3, 5], lambda: clicks.set_click(clip, "elbow.R", 5, (63.0, 82.0))),
+        ([3, 4, 5], lambda: clicks.set_click(clip, "elbow.R", 4, (64.0, 83.0))),
+        ([4, 5], lambda: clicks.remove_click(clip, "elbow.R", 3)),
+        ([4], lambda: clicks.remove_click(clip, "elbow.R", 5)),
+        ([], lambda: clicks.remove_click(clip, "elbow.R", 4)),
+        ([-2], lambda: clicks.set_click(clip, "elbow.R", -2, (62.0, 81.0))),  # the first image
+    ):
+        change()
+        assert shown() == frames == sorted(frame for frame in clicks.clicked_frames(clip))
+    assert clicks.get_click(clip, "elbow.R", -2) == [62.0, 81.0]
 
 
 def test_what_the_panel_does_not_edit_stays(project: ModuleType, blender: ModuleType, take: Path) -> None:

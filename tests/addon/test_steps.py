@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tricap.__main__ import main
@@ -201,8 +202,31 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
     assert "tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
 
 
+def test_where_the_fit_finds_nobody_the_panel_asks_for_clicks(
+    blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path
+) -> None:
+    """Running the same again would end as before. New clicks make the fit the next step."""
+    shutil.copytree(results, tmp_path / "out")
+    scene, panel = opened(blender, sample, tmp_path), importlib.import_module(f"{NAME}.steps.panel")
+    watch, clicks = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "clicks"))
+    scene.tricap.model = "auto"
+    for view in scene.tricap.views:
+        clicks.clear(view.clip)
+    path = tmp_path / "out" / "run.json"
+    run, keys = json.loads(path.read_text()), watch.refresh(scene).keys
+    run["stages"] = {stage: {**run["stages"][stage], "key": keys[stage]} for stage in ("measure", "track")}
+    run["stages"]["fit"] = {"seconds": 0.0, "key": keys["fit"], "not_done": "no clicked joints"}
+    path.write_text(json.dumps(run))
+    assert words().split()[2:6] == ["asks", "done", "done", "empty"] and watch.current(scene).next == "clicks"
+    assert "does not find the person by itself. Click at least three joints of the trunk" in why("clicks")
+    drawn = type(layout)().draw(panel.TRICAP_PT_main, blender.context)
+    assert drawn.highlighted == ["tricap.click_joints"] and "tricap.run" not in drawn.operators
+    click(blender, read_table(sample)["seeds"]["joints"])
+    assert words().split()[2:6:3] == ["done", "stale"] and watch.current(scene).can_run
+
+
 @pytest.mark.slow
-def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
+def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, why: Any, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
     scene, out = done, tmp_path / "out"
     with pytest.raises(RuntimeError, match="drag a joint first"):
@@ -235,13 +259,22 @@ def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done:
     values = motion.values[:, motion.dof_names.index("elbow.R flexion")]
     now = [channel().evaluate(frame) for frame in range(3)]
     assert now[:2] == pytest.approx(values[:2].tolist(), abs=1e-5) and now[2] == pytest.approx(values[2] + 0.5, abs=1e-5) and now != was
+    sigmas, own = importlib.import_module(f"{NAME}.editing.uncertainty").sigmas_of(body), after.frame_sigma_m
+    wanted = 1e3 * np.maximum(own["elbow.R"], own["wrist.R"])
+    assert sigmas["forearm.R"][1] == pytest.approx(wanted, rel=1e-5), "the sigmas are those of a rig that is built anew"
     entry = json.loads((out / "run.json").read_text())["stages"]["fit"]
     assert entry["fitted_again"] == [[0, 2]] and words().split()[5] == "stale", "a whole fit would adjust the shape, too"
+    assert why("body").startswith("Frames 0–2 were fitted again to your clicks. Fit Body also adjusts the shape")
+    assert why("rig").startswith("The scene plays frames 0–2 as they were fitted again")
     scene.tricap.fitting.gate_m = 0.04
+    assert why("body") == "Inputs have changed since this step ran. Run it again."
     assert blender.ops.tricap.fit_again() == {"FINISHED"} and words().split()[5] == "done", "more than clicks has changed: all is fitted"
 
 
-@pytest.mark.parametrize("text", ['{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])
+WRONG = '{"stages": {"fit": {"not_done": "", "fitted_again": [[0]]}}}'
+
+
+@pytest.mark.parametrize("text", [WRONG, '{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])
 def test_a_run_json_that_no_run_wrote(
     blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, tmp_path: Path, text: str
 ) -> None:
@@ -479,21 +512,50 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
     assert point == "empty" or drawn.properties.count("model") == {"opened": 2, "done": 1}[point], "the body is shown before the run"
     if point == "done":
         assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
+        assert drawn.highlighted == [] and blender.ops.tricap.add_robot() == {"FINISHED"}
+        assert type(layout)().draw(panel.TRICAP_PT_main, blender.context).highlighted == ["tricap.retarget"], "once there is a target"
         assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
     elif point == "empty":
         assert " ".join(drawn.texts).count("Save the Blender file first") == 1
         assert drawn.operators[:2] == ["tricap.load_sample", "wm.save_mainfile"]
 
 
+def test_a_view_through_the_camera_stays_there(blender: ModuleType, done: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the scene is built anew, with another camera."""
+    build = importlib.import_module(f"{NAME}.operators.build_scene")
+    areas = [area for area in blender.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D"]
+    view = areas[0].spaces.active.region_3d
+    monkeypatch.setattr(build, "_views", lambda context: [view])
+    view.view_perspective = "CAMERA"
+    assert blender.ops.tricap.build_scene() == {"FINISHED"} and view.view_perspective == "CAMERA"
+
+
+def test_results_that_can_hardly_be_right_are_called_doubtful(
+    blender: ModuleType, why: Any, done: Any, layout: Any, tmp_path: Path
+) -> None:
+    panel, path = importlib.import_module(f"{NAME}.steps.panel"), tmp_path / "out" / "run.json"
+    run = json.loads(path.read_text())
+    assert "doubtful " not in type(layout)().draw(panel.TRICAP_PT_main, blender.context).texts
+    run["stages"]["measure"]["residual_px"], run["stages"]["track"]["trajectories"] = 1.4, 0
+    run["stages"]["fit"]["limbs"] = {"right arm": {"guessed": 2, "seen": 1}}
+    path.write_text(json.dumps(run))
+    assert "Rays miss each other by 1.4 px" in why("surface") and why("tracks").startswith("No trajectory is left after the filters")
+    texts = type(layout)().draw(panel.TRICAP_PT_main, blender.context).texts
+    assert texts.count("doubtful ") == 3 and "Doubtful: 4 Surface, 5 Tracks, 6 Body. Unfold them for the reason." in " ".join(texts)
+
+
 def test_everything_is_offered_only_when_nothing_else_is_next(blender: ModuleType, layout: Any, sample: Path, tmp_path: Path) -> None:
     panel, watch = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("panel", "watch"))
     scene = opened(blender, sample, tmp_path)
-    offered = []
+    offered, highlighted = [], []
     for model in ("arm.R", "leg.L", "none"):  # clicked; not clicked; no clicks needed
         scene.tricap.model = model
         watch.refresh(scene)
-        offered.append("tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators)
+        drawn = type(layout)().draw(panel.TRICAP_PT_main, blender.context)
+        offered.append("tricap.run" in drawn.operators)
+        highlighted.append(drawn.highlighted)
     assert offered == [True, False, True]
+    assert highlighted == [["tricap.run"], ["tricap.click_joints"], ["tricap.run"]], "one button is the next one to press"
 
 
 def test_the_report_is_opened_in_the_browser(blender: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -548,7 +610,7 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
 
 
 def test_a_calibration_in_the_folder_of_the_footage_is_used(
-    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path
+    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path, capfd: Any
 ) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     shutil.copytree(sample, tmp_path / "film")
@@ -556,6 +618,13 @@ def test_a_calibration_in_the_folder_of_the_footage_is_used(
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
     assert words().startswith("done done") and blender.context.scene.camera.name == "Camera C"
+    write_rig(tmp_path / "film" / "rig.toml", renamed(read_rig(tmp_path / "film" / "rig.toml"), {"L": "R", "R": "L"}))
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "turned.blend"))
+    capfd.readouterr()
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    said = capfd.readouterr().out
+    assert said.count("from left to right") == 1 and "from left to right: R, C, L." in said, "the order is that of the cameras"
     (tmp_path / "film" / "rig.toml").write_text("damaged")
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
