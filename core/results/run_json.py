@@ -19,7 +19,7 @@ STAGE_FIGURES = {  # figures that a finished stage must have
 }
 SEEN = {"full": "the whole person is seen", "upper_body": "the images cut the person below"}  # why a model was chosen
 JOINTS = "it has the joints that are located"
-STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model")
+STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model", "surface")
 LARGEST_FIGURE = 1e12  # far above every figure of a run
 
 

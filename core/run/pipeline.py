@@ -36,6 +36,7 @@ from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out,
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, of_model, with_start
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.view_angles import no_view_alike
@@ -66,7 +67,7 @@ from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
 from .stages import CONTENT, STAGES
-from .take_run import Run, open_run
+from .take_run import SURFACE, Run, open_run
 from .workers import measure_at_once
 
 BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin", "outlines")  # of the fit, besides the report
@@ -103,7 +104,9 @@ def measure(run: Run, monitor: Monitor) -> None:
     run.warn(
         *check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor)
     )
-    run.finish_stage("measure", began, **surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean())))
+    run.note_surface(surface := store.digest(*(summary.key for summary in summaries)))
+    figures = surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean()))
+    run.finish_stage("measure", began, **figures, **{SURFACE: surface})
 
 
 def track(run: Run, monitor: Monitor) -> None:

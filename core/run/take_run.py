@@ -32,6 +32,10 @@ from .record import frame_table, new_record, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_keys, stage_keys, valid_stages
 
+SURFACE = "surface"  # of the measured stage in run.json: the digest of the keys of its frames, with the content of their images
+OTHER_IMAGES = "The images are not those that were measured before; tracks and body of these were removed."
+CACHED_FITS = ("cache/fit", "cache/fit_again", "cache/body")
+
 
 @dataclass(kw_only=True)
 class Run:
@@ -89,6 +93,16 @@ class Run:
         self.record["stages"] = {name: stages[name] for name in MADE_BY if name in stages}  # one made again is no longer the last
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
         self.results.write_run(self.record)
+
+    def note_surface(self, digest: str) -> None:
+        """Drop what was made from another surface than the measured one, whose digest this is. The key of a stage has neither the content
+        of images nor parts of a second of their times."""
+        if self.record["stages"].get("measure", {}).get(SURFACE, digest) == digest:
+            return
+        after = STAGES[STAGES.index("measure") + 1 :]
+        self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in (*after, "report")}
+        names = [name for stage in after for name in STAGE_INPUTS[stage].files]
+        self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *CACHED_FITS])]
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:

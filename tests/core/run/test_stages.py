@@ -12,6 +12,7 @@ import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation import store
+from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
 from tricap.core.run.file_digests import FileDigests
@@ -231,6 +232,24 @@ def test_a_run_of_a_copy_computes_nothing_and_of_another_image_everything(
     other_picture(next(iter(sorted((copy / "L").glob("*1.png")))))
     assert main.main(argv) == 0 and "Nothing has changed" not in capfd.readouterr().out
     assert (out / "clouds" / "0001.ply").read_bytes() != cloud
+
+
+def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_they_are_measured(plane_take: Path, tmp_path: Path) -> None:
+    """The stages after the measured one counted as done, beside clouds of other images."""
+    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
+    given, path = {"growing": {"spacing_px": 16}}, take / "L" / "0001.png"
+    os.utime(path, (1000, 1000))
+    pipeline.run(take, out, given, frames=(0, 2))
+    with take_run.open_run(take, out, given, (0, 2)) as again:
+        pipeline.measure(again, Monitor())
+        assert {*STAGES, "report"} == set(again.record["stages"]) and not again.notes
+    other_picture(path)
+    os.utime(path, (1000, 1000.5))
+    with take_run.open_run(take, out, given, (0, 2)) as job:
+        assert {*STAGES, "report"} == set(job.record["stages"])
+        pipeline.measure(job, Monitor())
+        assert set(job.results.read_run()["stages"]) == {"measure"} and job.notes == [take_run.OTHER_IMAGES]
+    assert not (out / "trajectories.npz").exists() and not (out / "report").exists() and not (out / "cache" / "body").exists()
 
 
 def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
