@@ -17,7 +17,7 @@ from ...motion.formats.markers import Markers, read_points_csv
 from ...motion.formats.trc import read_trc
 from ...motion.retarget.points import joint_of
 from ...results.folder import Results
-from ...take.footage import Footage
+from ...take.footage import Footage, footage_frames
 from ...take.sources import KeypointSource
 from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
@@ -150,7 +150,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
     """The keypoints of one [[keypoints]] entry, in the take's frames.
 
     Raises:
-        InputError: there are no such files, they cannot be read, or none of their names is a joint.
+        InputError: there are no such files, they cannot be read, or none of their names is a joint, or of their frames one of the take.
     """
     folder = footage.take.folder
     paths = sorted((p for p in bounded.matching(folder, source.files) if p.is_file()), key=lambda p: natural_order(p.name))
@@ -160,11 +160,24 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
         points = read_keypoints(paths)
         view = [v.name for v in footage.take.views].index(source.view)
         frames = footage.frames_of_images(view, points.number - source.offset_frames)
-        return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+        found = _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+        return _check_frames(footage, source, found)
     if len(paths) > 1:
         raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")
     markers = _markers(paths[0], source.axes)
-    return _places(source, markers.names, markers.frames - source.offset_frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+    frames = markers.frames - source.offset_frames
+    found = _places(source, markers.names, frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+    return _check_frames(footage, source, found)
+
+
+def _check_frames(footage: Footage, source: KeypointSource, found: JointPlaces) -> JointPlaces:
+    take = footage_frames(footage.take, footage.sequences)
+    if not ((found.frame >= take.start) & (found.frame < take.stop)).any():
+        raise InputError(
+            f"The keypoints “{source.files}” are of the frames {found.frame.min()} to {found.frame.max()} of the take, "
+            f"which has the frames {take.start} to {take.stop - 1}; correct `offset_frames` under [[keypoints]]."
+        )
+    return found
 
 
 def _markers(path: Path, axes: str | None) -> Markers:

@@ -21,9 +21,9 @@ from tricap.core.take.take import JOINTS, FrameClicks
 
 
 def _footage(folder):
-    views = (SimpleNamespace(name="L", offset_frames=0), SimpleNamespace(name="C", offset_frames=2))
-    take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout())
-    footage = SimpleNamespace(take=take, clocks=())
+    views = tuple(SimpleNamespace(name=name, offset_frames=n, has_clock=False) for name, n in (("L", 0), ("C", 2)))
+    take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout(), frames=(0, 12))
+    footage = SimpleNamespace(take=take, clocks=(), sequences=[SimpleNamespace(count=14)] * 2)
     footage.frames_of_images = partial(Footage.frames_of_images, footage)
     return footage
 
@@ -67,6 +67,29 @@ def test_a_missing_file_shifts_no_other(tmp_path) -> None:
     (tmp_path / "kp" / "C_002_keypoints.json").rename(tmp_path / "kp" / "C_b_keypoints.json")  # no number: the order counts
     found = read_source(_footage(tmp_path), _source(files="kp/*.json", view="L"))
     assert sorted(set(found.frame.tolist())) == [0, 1, 2]
+
+
+def test_two_files_of_one_image_are_refused(tmp_path) -> None:
+    """They were counted in the order of their names, so that every later file was shifted."""
+    _openpose(tmp_path / "kp", [_person(0)], [_person(4)], [_person(8)])
+    (tmp_path / "kp" / "C_1_keypoints.json").write_text((tmp_path / "kp" / "C_001_keypoints.json").read_text())
+    with pytest.raises(InputError, match="C_0*1_keypoints.json are both of image 1; remove"):
+        read_source(_footage(tmp_path), _source(files="kp/*.json", view="L"))
+    for number in range(4):
+        (tmp_path / "kp" / f"{number}_camera2.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": _person(number)}]}))
+    found = read_source(_footage(tmp_path), _source(files="kp/*_camera2.json", view="L"))
+    assert sorted(set(found.frame.tolist())) == [0, 1, 2, 3], "the number of the camera is not that of the image"
+
+
+def test_keypoints_of_no_frame_of_the_take_are_refused(tmp_path) -> None:
+    """They were ignored without a word."""
+    _openpose(tmp_path / "kp", [_person(0)], [_person(4)])
+    with pytest.raises(InputError, match="are of the frames -99 to -98 of the take, which has the frames 0 to 11; correct `offset_frames`"):
+        read_source(_footage(tmp_path), _source(files="kp/*.json", view="L", offset_frames=99))
+    (tmp_path / "p.csv").write_text("frame,time_s,RKnee x,RKnee y,RKnee z\n70,0,1,2,3\n73,1,1,2,3\n")
+    with pytest.raises(InputError, match="“p.csv” are of the frames 70 to 73 of the take"):
+        read_source(_footage(tmp_path), _source(files="p.csv"))
+    assert len(read_source(_footage(tmp_path), _source(files="p.csv", offset_frames=62)).frame) == 2
 
 
 @pytest.mark.parametrize(
