@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..body.model_file import read_model
+from ..fitting.inputs.take_inputs import clicks_of_no_joint
 from ..fitting.settings import START_ALONE, FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -47,29 +48,30 @@ LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joint
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself.
+    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself. Clicks that the body does not have.
 
     Raises:
         InputError: there is no such body model.
     """
+    foreign = [remark(Cause.CLICKS, sentence) for sentence in clicks_of_no_joint(take)]
     if take.joints_model is None or take.keypoints:
-        return []
+        return foreign
     joints = read_model(take.joints_model).skeleton.joint_names
     clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
     if not clicked and take.body_model in START_ALONE:
-        return []
+        return foreign
     if not clicked:
         sentence = (
             f"No joint of the body “{take.body_model}” is clicked. It starts by itself only where the whole person is visible; "
             "otherwise the result will have surface and tracks, but no body."
         )
-        return [doubtful(Cause.NO_CLICKS, sentence, advice)]
+        return [*foreign, doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
     if not bare:
-        return []
+        return foreign
     sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to find their pose."
-    return [doubtful(Cause.FEW_CLICKS, sentence, advice)]
+    return [*foreign, doubtful(Cause.FEW_CLICKS, sentence, advice)]
 
 
 def seed_findings(footage: Footage) -> list[Finding]:

@@ -85,6 +85,9 @@ def renumbered(table: Table, per_image: int, before: int) -> Table:
         made["seeds"] = {**made["seeds"], "frame": first(made["seeds"].get("frame", 0))}
     if "keyframes" in made:
         by_frame = {first(k["frame"]): {**k, "frame": first(k["frame"])} for k in reversed(made["keyframes"])}
+        seeds = made.get("seeds", {})
+        if seeds.get("joints") and (same := by_frame.pop(seeds["frame"], None)):
+            made["seeds"] = {**seeds, "joints": {**same.get("joints", {}), **seeds["joints"]}}
         made["keyframes"] = [by_frame[frame] for frame in sorted(by_frame)]
     if "corrections" in made:
         made["corrections"] = [{**c, **({"frame": first(c["frame"])} if "frame" in c else {"frames": span(c["frames"])})}

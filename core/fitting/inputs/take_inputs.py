@@ -101,15 +101,35 @@ def missing_for_fit(footage: Footage) -> str:
 
 
 def clicks_left_out(footage: Footage) -> list[str]:
-    """Warnings about clicked joints outside the footage's frames."""
+    """Warnings about clicked joints outside the footage's frames, and about those that the body does not have."""
     outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
-    if not outside or missing_for_fit(footage):
+    if missing_for_fit(footage):
         return []
+    foreign = clicks_of_no_joint(footage.take)
+    if not outside:
+        return foreign
     begins = "; the fit begins at other clicks or keypoints, or by itself" if footage.take.clicks.frame in outside else ""
     return [
         f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
-        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."
+        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}.",
+        *foreign,
     ]
+
+
+def clicks_of_no_joint(take: Take) -> list[str]:
+    """A warning about clicked joints that the take's body model does not have.
+
+    Raises:
+        InputError: there is no such body model.
+    """
+    if take.joints_model is None:
+        return []
+    joints = read_model(take.joints_model).skeleton.joint_names
+    foreign = [f"{name} (frame {s.frame})" for s in _with_joints(take) for name in s.joints if name not in joints]
+    has = f"the body “{take.body_model}” has only {', '.join(joints)}"
+    return (
+        [f"The clicks of {', '.join(foreign)} are not used: {has}. Choose another `model` under [body], or remove them."] if foreign else []
+    )
 
 
 def _with_joints(take: Take) -> list[FrameClicks]:

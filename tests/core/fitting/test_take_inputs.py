@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tricap.core.checking.take_check import joint_findings
 from tricap.core.fitting.inputs.take_inputs import clicks_in, clicks_left_out, joint_named, missing_for_fit, read_contours, read_source
 from tricap.core.foundation.errors import InputError
 from tricap.core.images.interlace import FieldLayout
@@ -107,6 +108,7 @@ def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, 
         clicks=FrameClicks(frame=seeds, joints=joints),
         keyframes=tuple(FrameClicks(frame=f, joints=joints) for f in keyframes),
         body_model="full",
+        joints_model="full",
         keypoints=(),
     )
     footage = SimpleNamespace(take=take, frames=frames)
@@ -114,6 +116,18 @@ def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, 
     assert not missing_for_fit(footage)  # without clicks the body starts by itself
     warnings = clicks_left_out(footage)
     assert len(warnings) == bool(said) and all(re.search(said, w) for w in warnings)
+
+
+def test_clicks_of_joints_that_the_body_does_not_have_are_named() -> None:
+    """They were ignored without a word."""
+    at = {"L": np.zeros(2), "C": np.zeros(2)}
+    clicks = FrameClicks(frame=2, joints={"shoulder.R": at, "elbow.R": at})
+    keyframes = (FrameClicks(frame=5, joints={"elbow.R": at, "knee.L": at}),)
+    take = SimpleNamespace(clicks=clicks, keyframes=keyframes, body_model="arm.R", joints_model="arm.R", keypoints=())
+    (said,) = clicks_left_out(SimpleNamespace(take=take, frames=range(9)))
+    assert said.startswith("The clicks of knee.L (frame 5) are not used: the body “arm.R” has only shoulder.R, elbow.R, wrist.R.")
+    assert said in [finding.sentence for finding in joint_findings(take)]
+    assert clicks_left_out(SimpleNamespace(take=SimpleNamespace(**{**vars(take), "joints_model": "full"}), frames=range(9))) == []
 
 
 def test_coco_annotations_and_results(tmp_path) -> None:

@@ -72,6 +72,8 @@ def test_frames_are_renumbered_when_an_image_becomes_two() -> None:
     assert renumbered(double, 1, 2) == table and renumbered({"fps": 25.0}, 2, 1) == {"fps": 25.0}
     both = {"keyframes": [{"frame": 4, "joints": {"a": 1}}, {"frame": 5, "joints": {"a": 2}}], "frames": [3, 9]}
     assert renumbered(both, 1, 2) == {"keyframes": [{"frame": 2, "joints": {"a": 1}}], "frames": [1, 5]}
+    met = {"seeds": {"frame": 4, "joints": {"a": 1}}, "keyframes": [{"frame": 5, "joints": {"a": 2, "b": 3}}]}
+    assert renumbered(met, 1, 2) == {"seeds": {"frame": 2, "joints": {"a": 1, "b": 3}}, "keyframes": []}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
