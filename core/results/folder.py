@@ -237,13 +237,19 @@ def check_inside(path: Path, folder: Path) -> None:
 
 
 def _not_from_a_run(folder: Path) -> list[str]:
-    """Files and folders that have the name of a result, or `cache`, although no run has written to the folder.
+    """Files and folders that have the name of a result, `cache` or run.json, although no run has written to the folder.
 
-    A run that was stopped early leaves a cache, and a killed one its lock.
+    A run that was stopped early leaves a checkpoint, and a killed one its lock.
     """
-    cache = folder / "cache"
-    if (folder / "run.json").exists() or (folder / NAME).exists():
+    if bounded.is_of_a_run(folder) or _has_checkpoints(folder / "cache"):
         return []
-    if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
-        return []
-    return [name for name in ("cache", *RESULTS) if (folder / name).exists()]
+    found = [name for name in ("cache", "run.json", *RESULTS) if (folder / name).exists()]
+    return [name for name in found if name != "cache" or any(not p.is_dir() for p in (folder / name).rglob("*"))]
+
+
+def _has_checkpoints(cache: Path) -> bool:
+    """Whether a folder has our checkpoints, and nothing else."""
+    if not cache.is_dir() or not all(p.is_dir() for p in cache.iterdir()):
+        return False
+    files = [file for stage in cache.iterdir() for file in stage.iterdir()]
+    return all(file.suffix in (".npz", ".part") for file in files) and any(store.header_of(file) for file in files)

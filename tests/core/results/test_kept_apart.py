@@ -78,7 +78,7 @@ def test_a_batch_goes_into_none_of_its_takes(take: Path, tmp_path: Path, capfd: 
 def test_a_take_where_results_are_replaced(take: Path, tmp_path: Path, capfd: Capture) -> None:
     """OUT may hold the take, as that of the demo does, but not where a run clears away."""
     (tmp_path / "out" / "report").mkdir(parents=True)
-    (tmp_path / "out" / "run.json").write_text("{}")
+    (tmp_path / "out" / "run.json").write_text('{"format": "tricap-run"}')
     inside = tmp_path / "out" / "report" / "take"
     take.rename(inside)
     assert "where a run replaces files" in refused(["run", str(inside), "--out", str(tmp_path / "out")], capfd)
