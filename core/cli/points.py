@@ -34,9 +34,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     take = read_take(args.take)
     settings = settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), frame_range(args.frames)
-    check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(args.out, take.folder, (path for s in footage.sequences for path in s.files()))
     for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):
-        check_separate_folder(folder, take.folder, (s.files()[0] for s in footage.sequences))
+        check_separate_folder(folder, take.folder, (path for s in footage.sequences for path in s.files()))
         if folder != args.pictures:
             check_inside(folder, real_path(args.pictures))
     footage = footage if frames is None else take_run.only_frames(footage, frames)

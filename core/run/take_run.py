@@ -164,7 +164,7 @@ def open_run(
         clicked_depth(footage, name, at)
     if take.joints_model is not None:
         read_model(take.joints_model)
-    check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(out, take.folder, (path for s in footage.sequences for path in s.files()))
     check_pictured(footage.frames, pictures)
     keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
     with Results(out).opened() as results:

@@ -68,6 +68,34 @@ def test_results_go_into_no_footage_whatever_way_leads_there(take: Path, tmp_pat
     assert names(tmp_path) == before
 
 
+def test_results_go_into_no_folder_of_footage_that_is_spread_over_several(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    """Only the folder of the first image was looked at."""
+    for view in "LCR":
+        for n, path in enumerate(sorted((take / view).iterdir())):
+            part = take / ("p2" if n else "p1") / view
+            part.mkdir(parents=True, exist_ok=True)
+            path.rename(part / path.name)
+    text = (take / "take.toml").read_text(encoding="utf-8")
+    for view in "LCR":
+        text = text.replace(f'"{view}/*.png"', f'"p*/{view}/*.png"')
+    (take / "take.toml").write_text(text, encoding="utf-8")
+    before = names(tmp_path)
+    for command in ("run", "measure"):
+        assert "contains the footage" in refused([command, str(take), "--out", str(take / "p2" / "C")], capfd)
+    assert names(tmp_path) == before
+
+
+@LINKS
+@pytest.mark.parametrize("name", ["fields", "cache", "report"])
+def test_footage_where_results_are_replaced(take: Path, tmp_path: Path, capfd: Capture, name: str) -> None:
+    (tmp_path / "films" / name).mkdir(parents=True)
+    (take / "L").rename(tmp_path / "films" / name / "L")
+    (take / "L").symlink_to(tmp_path / "films" / name / "L")
+    before = names(tmp_path)
+    said = refused(["run", str(take), "--out", str(tmp_path / "films")], capfd)
+    assert "is inside" in said and "where a run replaces files; choose another folder" in said and names(tmp_path) == before
+
+
 def test_a_batch_goes_into_none_of_its_takes(take: Path, tmp_path: Path, capfd: Capture) -> None:
     other = shutil.copytree(take, tmp_path / "throw")
     before = names(tmp_path)
