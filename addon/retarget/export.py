@@ -20,6 +20,7 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import is_of_points, read_motion_source, read_points
 from ...core.motion.tables import read_joints
 from ...core.results.folder import check_not_result, lost
+from ...core.results.listed_files import PLY, check_files, list_files
 from ...core.results.outputs import check_output
 from ...core.results.run_json import read_run
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
@@ -180,6 +181,8 @@ def _copy_ply(out: Path, folder: Path, of: str) -> str:
     files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := sorted((out / name).glob("*.ply")))), None)
     if files is None:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
+    check_files(folder, PLY)
+    list_files(folder, PLY, [file.name for file in files])
     for file in files:
         store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"

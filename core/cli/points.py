@@ -14,6 +14,7 @@ from ..foundation.progress import Monitor
 from ..report.pictures import png
 from ..report.point_pictures import paths_in_space, paths_over_footage
 from ..results.folder import Results, check_inside, check_separate_folder
+from ..results.listed_files import PICTURES, check_files, list_files
 from ..run import take_run
 from ..run.settings import settings_of
 from ..take.footage import Footage, open_take
@@ -37,6 +38,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_separate_folder(args.out, take.folder, (path for s in footage.sequences for path in s.files()))
     for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):
         check_separate_folder(folder, take.folder, (path for s in footage.sequences for path in s.files()))
+        check_files(folder, PICTURES)
         if folder != args.pictures:
             check_inside(folder, real_path(args.pictures))
     footage = footage if frames is None else take_run.only_frames(footage, frames)
@@ -77,12 +79,15 @@ def follow_points(
 
 def _draw(folder: Path, footage: Footage, names: tuple[str, ...], tracked: KeyPoints, monitor: Monitor) -> None:
     """Write a picture per frame and view, and paths.png, the paths in space."""
+    in_space = paths_in_space(names, tracked, footage.rig.cameras[footage.take.reference])
+    list_files(folder, PICTURES, ["paths.png"] if in_space is not None else [])
+    for camera in footage.rig.cameras:
+        list_files(folder / camera.name, PICTURES, [f"{frame:04d}.png" for frame in tracked.frames])
     for t, frame in enumerate(tracked.frames.tolist()):
         monitor.step("pictures", t, len(tracked.frames))
         for k, (grey, camera) in enumerate(zip(footage.read_whole(frame), footage.rig.cameras)):
             picture = paths_over_footage(grey, names, tracked.xy_px[:, :, k], t)
             store.write_bytes(folder / camera.name / f"{frame:04d}.png", png(picture))
-    in_space = paths_in_space(names, tracked, footage.rig.cameras[footage.take.reference])
     if in_space is not None:
         store.write_bytes(folder / "paths.png", png(in_space))
 
