@@ -21,7 +21,8 @@ from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
 from ..results.listed_files import check_files
-from ..take.bar_file import write_bar
+from ..results.outputs import check_output, check_replaceable
+from ..take.bar_file import FIRST, bar_path, write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
 
@@ -113,6 +114,9 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     if not args.format and args.out.is_dir():
         raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
+    if not args.format and (board is None or args.with_board is not None):
+        check_output(bar_path(args.out), [path for path in (args.points, args.like) if path is not None])
+        check_replaceable(bar_path(args.out), *FIRST)
     if args.report:
         check_report(args.report)
     if args.format:

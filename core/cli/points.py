@@ -15,12 +15,13 @@ from ..report.pictures import png
 from ..report.point_pictures import paths_in_space, paths_over_footage
 from ..results.folder import Results, check_inside, check_separate_folder
 from ..results.listed_files import PICTURES, check_files, list_files
+from ..results.outputs import check_replaceable
 from ..run import take_run
 from ..run.settings import settings_of
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from ..tracking.key_points import KeyPoints, track_key_points
-from ..tracking.point_tables import ChosenPoints, read_points, write_key_points
+from ..tracking.point_tables import IMAGES_HEAD, SPACE_HEAD, ChosenPoints, read_points, write_key_points
 from ..tracking.settings import TrackStatus
 from ..tracking.track import TrackingRules
 from .arguments import frame_range, overrides
@@ -48,6 +49,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     points = _by_name(read_points(args.points, with_views=True), footage, args.points)
     views = tuple(c.name for c in footage.rig.cameras)
     with Results(args.out).opened() as results:
+        check_replaceable(results.path("points3d.csv"), SPACE_HEAD)
+        check_replaceable(results.path("points2d.csv"), IMAGES_HEAD)
         tracked = follow_points(footage, points, first, settings, monitor)
         write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
         if args.pictures is not None:

@@ -157,6 +157,35 @@ def test_results_that_are_read_are_not_replaced(take: Path, tmp_path: Path, capf
     assert "is a result, which this command replaces" in said and path.read_bytes() == before
 
 
+def test_the_bar_next_to_a_rig_replaces_no_other_file(tmp_path: Path, capfd: Capture) -> None:
+    """Its name follows from that of the rig: nobody gave it."""
+    (tmp_path / "bar").mkdir()
+    argv = ["calibrate", str(tmp_path / "bar"), "--bar-length", "0.5", "--out", str(tmp_path / "b.toml")]
+    (tmp_path / "b_bar.csv").write_text("point,view,x,y\na,L,60,60\n")
+    assert "b_bar.csv would be overwritten, and is not of an earlier call" in refused(argv, capfd)
+    assert "b_bar.csv is also an input" in refused([*argv, "--points", str(tmp_path / "b_bar.csv")], capfd)
+    (tmp_path / "b_bar.csv").write_text("frame,1 from L x\n")
+    assert "it needs a folder of images" in refused(argv, capfd)
+
+
+@pytest.mark.parametrize("name", ["points3d.csv", "points2d.csv", "contours/C.csv"])
+def test_tables_of_somebody_else_are_not_replaced(take: Path, tmp_path: Path, capfd: Capture, name: str) -> None:
+    (tmp_path / "points.csv").write_text("point,view,x,y\na,L,60,60\na,C,60,60\n")
+    (tmp_path / "polygon.csv").write_text("x,y\n20,20\n60,20\n60,60\n")
+    out = tmp_path / "out"
+    if "contours" in name:
+        argv = ["contour", str(take), "--view", "C", "--polygon", str(tmp_path / "polygon.csv"), "--set", "fitting.use_surface=false"]
+    else:
+        argv = ["track", str(take), "--points", str(tmp_path / "points.csv")]
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("mine")
+    assert f"{Path(name).name} would be overwritten, and is not of an earlier call" in refused([*argv, "--out", str(out)], capfd)
+    assert (out / name).read_text() == "mine"
+    (out / name).unlink()
+    for _ in range(2):
+        assert main.main([*argv, "--out", str(out), "--frames", "0:1", "--quiet"]) == 0
+
+
 def test_pictures_replace_no_result(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{}")
     for name in ("skin/texture.png", "report/cloud_0000.png"):
