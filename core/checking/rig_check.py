@@ -26,6 +26,7 @@ from .view_matches import PairMatches
 FOCAL = (0.4, 12.0)  # of the image's longer side: 103° and 5° of view
 OFF_CENTRE = 0.2  # of the image's longer side
 FAR_APART_M = 100.0  # longer than any hall
+NEAR_M = 0.01  # between all cameras
 SAME_PLACE = 0.005  # of the longest base
 MOST_COMPARED = 40  # cameras, each with every other one
 LARGE_SIGMA0_PX = 1.0
@@ -91,8 +92,14 @@ def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
 
 
 def unit_findings(rig: Rig) -> list[Finding]:
-    """Cameras further apart than any hall is long: their positions are in another unit than the file states."""
+    """Cameras further apart than any hall is long, or nearer to each other than their lenses are wide: their positions are in another unit
+    than the file states."""
     longest = max(_bases(rig.cameras).values(), default=0.0)
+    if 0 < longest < NEAR_M:
+        sentence = (
+            f"The cameras are only up to {1000 * longest:.2g} mm apart: rig.toml seems to be in metres, and `unit` to be another one."
+        )
+        return [wrong(Cause.UNIT, sentence, 'Write unit = "m" under [metadata] of rig.toml, or the unit that it is in.', base_m=longest)]
     if longest < FAR_APART_M:
         return []
     sentence = f"The cameras are up to {longest:.0f} m apart: rig.toml seems to be in millimetres or centimetres, not in metres."

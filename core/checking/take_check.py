@@ -33,7 +33,6 @@ from .rig_check import (
     rig_findings,
     same_views,
     stale_finding,
-    unit_findings,
     wide_findings,
 )
 from .survey import frozen_view, gap_findings, picture_findings, rate_findings, survey
@@ -68,6 +67,11 @@ def joint_findings(take: Take) -> list[Finding]:
         )
         return [*foreign, doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
+    few = {*joints} <= {name for names in LIMBS.values() for name in (*names, "toe.R", "toe.L")}
+    missing = [name for limb, names in LIMBS.items() if few and {*names} <= {*joints} for name in names if name not in clicked]
+    if not bare and missing:
+        sentence = f"Not clicked in two views: {', '.join(missing)}. The fit has to find where the limb ends or bends."
+        return [*foreign, remark(Cause.FEW_CLICKS, sentence, advice)]
     if not bare:
         return foreign
     sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to find their pose."
@@ -266,7 +270,8 @@ def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
 
 
 def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
-    """Views that are identical, swapped or frozen, or the rig of another recording, from the first frames: about a second in every run.
+    """Views that are identical, swapped or frozen, a rig that is impossible or of another recording, from the first frames: about a second
+    in every run.
 
     Raises:
         InputError: an image cannot be read.
@@ -276,7 +281,7 @@ def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
     frozen = [frozen_view(name) for name in frozen_views(footage, frame, images)]
     pairs = match_views([[rows.rows(image) for image in images]], rows)
     return same_views(pairs, names) or [
-        *unit_findings(footage.rig),
+        *geometry_findings(footage.rig),
         *frozen,
         *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px),
     ]

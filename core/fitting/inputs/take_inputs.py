@@ -23,7 +23,7 @@ from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import START_ALONE, FitSettings
-from .clicks import initial_clicks, read_clicks
+from .clicks import check_apart, initial_clicks, read_clicks
 from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
@@ -82,13 +82,15 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     """Check that clicks and degrees of freedom are those of the take's body model, before hours of computation.
 
     Raises:
-        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints of a limb are clicked.
+        InputError: the model has no such degree of freedom, clicks contradict each other or coincide, or a limb has too few of them.
     """
     take, clicks = footage.take, clicks_in(footage)
     if missing_for_fit(footage):
         return
     model = with_limits(read_model(str(take.joints_model)), take.limits, take.locked)
     names = model.skeleton.joint_names
+    for frame, at in clicks.items():
+        check_apart({name: views for name, views in at.items() if name in names}, frame)
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if places and not take.keypoints and take.body_model not in START_ALONE:
         best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))

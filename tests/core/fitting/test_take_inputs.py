@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tricap.core.checking.take_check import joint_findings
+from tricap.core.fitting.inputs.clicks import check_apart
 from tricap.core.fitting.inputs.take_inputs import clicks_in, clicks_left_out, joint_named, missing_for_fit, read_contours, read_source
 from tricap.core.foundation.errors import InputError
 from tricap.core.images.interlace import FieldLayout
@@ -128,6 +129,18 @@ def test_clicks_of_joints_that_the_body_does_not_have_are_named() -> None:
     assert said.startswith("The clicks of knee.L (frame 5) are not used: the body “arm.R” has only shoulder.R, elbow.R, wrist.R.")
     assert said in [finding.sentence for finding in joint_findings(take)]
     assert clicks_left_out(SimpleNamespace(take=SimpleNamespace(**{**vars(take), "joints_model": "full"}), frames=range(9))) == []
+
+
+def test_joints_that_are_not_clicked_or_clicked_at_one_place_are_named() -> None:
+    at = {"L": np.zeros(2), "C": np.ones(2)}
+    clicks = FrameClicks(frame=2, joints={"shoulder.R": at, "elbow.R": {view: xy + 40 for view, xy in at.items()}})
+    take = SimpleNamespace(clicks=clicks, keyframes=(), body_model="arm.R", joints_model="arm.R", keypoints=())
+    assert [finding.sentence for finding in joint_findings(take)][0].startswith("Not clicked in two views: wrist.R.")
+    check_apart(clicks.joints, 2)
+    with pytest.raises(
+        InputError, match="elbow.R and wrist.R are clicked at the same pixels in frame 2; click each joint at its own place"
+    ):
+        check_apart({**clicks.joints, "wrist.R": clicks.joints["elbow.R"]}, 2)
 
 
 def test_coco_annotations_and_results(tmp_path) -> None:
