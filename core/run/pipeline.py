@@ -149,6 +149,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         raise
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
+    run.warn_if_replaced()
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
     noted: dict[str, Any] = {"start": start_figures(given.start)} if given.start is not None else {}
     if run.footage.take.body_model == AUTO_BODY:
@@ -164,6 +165,7 @@ def fit(run: Run, monitor: Monitor) -> None:
 def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
+    run.warn_if_replaced()
     run.record["stages"].pop("report", None)  # a page does not report on the page before it
     shown = Report(
         footage=run.footage,
