@@ -122,8 +122,13 @@ def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[s
     began = time.perf_counter()
     try:
         with take_run.open_run(Path(take), Path(out), overrides, restart=restart) as job:
-            pipeline.all_stages(job, Monitor(_reporter(take)))
-            _scene(job)
+            if pipeline.is_complete(job):
+                job.record["warnings"] = job.results.read_run().get("warnings", [])
+                if not blend_file.is_whole(job.results.path(blend_file.BLEND)):
+                    _scene(job)
+            else:
+                pipeline.all_stages(job, Monitor(_reporter(take)))
+                _scene(job)
         status, said = Status.DONE, _summary_of(job)
     except Exception as error:  # the edge of the worker: every error goes into the summary
         status, said = Status.INVALID_INPUT, sentence_of(error) or ""
