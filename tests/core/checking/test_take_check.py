@@ -434,6 +434,12 @@ def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int
         }
 
 
+def test_a_black_image_does_not_make_the_others_repeats() -> None:
+    energy, spread = np.array([[np.nan, 1.0, 60.0, 60.0]]), np.array([[50.0, 50.0, 0.0, 50.0]])
+    found = picture_findings(Survey(frames=range(4), energy=energy, spread=spread, bright=3 * spread, white=0 * spread), ("C",))
+    assert not [finding for finding in found if finding.cause == Cause.REPEATED_FRAMES]
+
+
 def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
     take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
     files = pictures(take, "R")
