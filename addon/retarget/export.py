@@ -46,6 +46,8 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
         if ending in OTHERS or any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    if kind in BY_BLENDER and file.suffix.lower() not in ENDINGS[kind]:
+        raise InputError(f"{file.name} does not end in {' or '.join(ENDINGS[kind])}; write the name with that ending.")
     check_output(file, [] if out is None else [out])
     if file.name != named.name and file.exists():
         raise InputError(f"{file.name} exists already; write the name with its ending to replace it.")
