@@ -29,6 +29,7 @@ from .rig_check import (
     agreeing_share,
     clicked_pairs,
     geometry_findings,
+    moved_findings,
     rig_distances,
     rig_findings,
     same_views,
@@ -190,6 +191,8 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         without_time = rig_distances(pairs, footage.rig.cameras, names)  # for views whose time offset cannot be estimated
         distance = {o.view: without_time[o.view] for o in offsets if o.view in without_time and not o.doubtful}
         findings += stale_finding(distance | {o.view: o.distance_px for o in offsets if math.isfinite(o.distance_px)})
+        if not any(o.doubtful for o in offsets):
+            findings += moved_findings(pairs, footage.rig.cameras, names)
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return findings, figures
 
