@@ -33,6 +33,7 @@ LONGEST_PATTERN = 1000  # characters of a pattern of files
 WILDCARDS = frozenset("*?[")
 MARKS_OF_A_RUN = {"run.json": b'{"format":"tricap-run"', ".tricap-lock": b'{"pid":'}  # how these files begin, without white space
 LONGEST_MARK = 100  # bytes
+LISTED_FILES = ".tricap-files"  # a list of the files that a command wrote into a folder, such as pictures
 DEEPEST = 64  # tables and lists in each other
 TOO_DEEP = f"more than {DEEPEST} tables and lists in each other"
 WHOLE_BITS = 63  # of a whole number, as TOML has it
@@ -128,7 +129,8 @@ def matching(folder: Path, pattern: str) -> list[Path]:
     """What a pattern of files names in a folder; nothing where it is no pattern.
 
     Every folder is searched once for each part of the pattern: two links to the folder itself give “*/*/*/*.png” sixteen names for it,
-    and twenty-five parts more names than anybody can wait for. A wildcard does not enter the folder of a run: its pictures are no footage.
+    and twenty-five parts more names than anybody can wait for. A wildcard does not enter the folder of a run, or of our pictures:
+    these are no footage.
     """
     if len(pattern) > LONGEST_PATTERN:
         return []
@@ -144,12 +146,12 @@ def matching(folder: Path, pattern: str) -> list[Path]:
 
 
 def _folders(outer: Path, part: str) -> list[Path]:
-    """The folders that a part of a pattern names, without those of runs and what is inside these, unless the part is a plain name."""
+    """The folders that a part of a pattern names; of a pattern with wildcards without those that we wrote, and what is inside these."""
     found = [path for path in outer.glob(part) if path.is_dir()]
     if not WILDCARDS.intersection(part):
         return found
-    of_runs = {path for path in found if path != outer and is_of_a_run(path)}
-    return [path for path in found if not of_runs.intersection((path, *path.parents))]
+    ours = {path for path in found if path != outer and (is_of_a_run(path) or _begins(path / LISTED_FILES, b"["))}
+    return [path for path in found if not ours.intersection((path, *path.parents))]
 
 
 def is_of_a_run(folder: Path) -> bool:

@@ -11,7 +11,7 @@ from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS
 
-LIST = ".tricap-files"
+LIST = bounded.LISTED_FILES
 PICTURES = tuple(f"*{ending}" for ending in IMAGE_ENDINGS)
 PLY = ("*.ply",)
 

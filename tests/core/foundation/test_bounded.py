@@ -97,7 +97,10 @@ def test_patterns_are_matched_as_people_write_them(tmp_path: Path) -> None:
         assert sorted(found) == names, pattern[:50]
 
 
-@pytest.mark.parametrize("name, mark", [("run.json", '{\n "format": "tricap-run",\n'), (".tricap-lock", '{"pid": 1, "host": "a"}\n')])
+@pytest.mark.parametrize(
+    "name, mark",
+    [("run.json", '{\n "format": "tricap-run",\n'), (".tricap-lock", '{"pid": 1, "host": "a"}\n'), (".tricap-files", '[\n "1.png"\n]\n')],
+)
 def test_a_wildcard_does_not_enter_a_folder_of_results(tmp_path: Path, name: str, mark: str) -> None:
     """Pictures of a run in the take became footage, or masks, of the next run."""
     for path in ("films/L/0.png", "results/fields/L/1.png", "results/report/2_L.png", "theirs/L/3.png"):
