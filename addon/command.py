@@ -146,11 +146,19 @@ def _check(args: argparse.Namespace) -> None:
     named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), *movies)
     if all(path is None for _, path, _ in named):
         raise InputError("Nothing to write: give --blend FILE.blend, --preview FILE.png, --turntable FILE.mp4 or --film FILE.mp4.")
+    _check_skins(args)
     for flag, path, ending in named:
         if path is not None:
             bounded.check_name(bounded.real_path(path.parent) / path.name)
         if path is not None and path.suffix.lower() != ending:
             raise InputError(f"{flag} {path} is not a {ending} file; choose a name that ends in {ending}.")
+
+
+def _check_skins(args: argparse.Namespace) -> None:
+    """Skins next to no such .blend file are not of an earlier scene, unless they lie in OUT."""
+    skins = None if args.blend is None or not args.exact_skin else args.blend.with_suffix(".pc2")
+    if skins is not None and skins.exists() and not args.blend.exists() and bounded.real_path(skins.parent) != bounded.real_path(args.out):
+        raise InputError(f"--exact-skin would overwrite {skins}, which is not of an earlier {args.blend.name}; choose another name.")
 
 
 def register() -> None:

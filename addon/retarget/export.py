@@ -20,6 +20,7 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import is_of_points, read_motion_source, read_points
 from ...core.motion.tables import read_joints
 from ...core.results.folder import check_not_result, lost
+from ...core.results.listed_files import PLY, check_files, list_files
 from ...core.results.outputs import check_output
 from ...core.results.run_json import read_run
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
@@ -45,6 +46,8 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
         if ending in OTHERS or any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    if kind in BY_BLENDER and file.suffix.lower() not in ENDINGS[kind]:
+        raise InputError(f"{file.name} does not end in {' or '.join(ENDINGS[kind])}; write the name with that ending.")
     check_output(file, [] if out is None else [out])
     if file.name != named.name and file.exists():
         raise InputError(f"{file.name} exists already; write the name with its ending to replace it.")
@@ -180,6 +183,8 @@ def _copy_ply(out: Path, folder: Path, of: str) -> str:
     files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := sorted((out / name).glob("*.ply")))), None)
     if files is None:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
+    check_files(folder, PLY)
+    list_files(folder, PLY, [file.name for file in files])
     for file in files:
         store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"

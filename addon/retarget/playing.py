@@ -20,6 +20,7 @@ from ...core.motion.formats.markers import Markers
 from ...core.motion.formats.ply import write_mesh
 from ...core.motion.plausible import check_span
 from ...core.motion.retarget.rig import Motion, Rig
+from ...core.results.listed_files import PLY, check_files, list_files
 from ..scene import layers, stored
 from ..scene.armature import JOINTS_KEY
 from ..scene.standing import curves_of
@@ -216,7 +217,7 @@ def writing_skins(armature_object: bpy.types.Object, folder: Path, monitor: Moni
     """Write the meshes as they are deformed in every frame that Blender plays, one PLY file and step for each frame; returns a summary.
 
     Raises:
-        InputError: there are no meshes, Blender does not move one of them, or a file cannot be written.
+        InputError: there are no meshes, Blender does not move one of them, the folder has other PLY files, or a file cannot be written.
         Cancelled: the monitor was cancelled; the files written so far stay.
     """
     scene, skins, monitor = bpy.context.scene, skins_of(armature_object), monitor or Monitor()
@@ -225,6 +226,8 @@ def writing_skins(armature_object: bpy.types.Object, folder: Path, monitor: Moni
     for thing in (armature_object, *skins):
         check_plays(thing)
     frames, now = exported_frames(scene), scene.frame_current
+    check_files(folder, PLY)
+    list_files(folder, PLY, [f"{frame:04d}.ply" for frame in frames])
     try:
         for i, frame in enumerate(frames):
             monitor.step("writing skins", i, len(frames))

@@ -17,6 +17,7 @@ from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
 from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart, read_image
+from ..results.listed_files import PICTURES, check_files
 from . import report, verdict
 from .bar_lenses import calibrate_bar
 from .bars import BarObservations
@@ -312,15 +313,29 @@ def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     return replace(calibration, network=moved, other=other, unknowns=replace(calibration.unknowns, block=other.block))
 
 
+FIGURES = "calibration.json"
+
+
+def check_report(folder: Path) -> None:
+    """Check that a folder has no images but those of an earlier report.
+
+    Raises:
+        InputError: it has.
+    """
+    if not (folder / FIGURES).is_file():
+        check_files(folder, PICTURES)
+
+
 def write_report(folder: Path, result: CalibratedRig) -> list[Path]:
     """Write calibration.txt, calibration.json and the pictures; their paths.
 
     Raises:
-        InputError: the folder cannot be written to.
+        InputError: the folder has other images, or cannot be written to.
     """
     calibration, quality, judged = result.calibration, result.quality, result.verdict
     folder = Path(folder)
-    paths = [folder / "calibration.txt", folder / "calibration.json"]
+    check_report(folder)
+    paths = [folder / "calibration.txt", folder / FIGURES]
     store.write_text(paths[0], report.page(calibration, quality, judged))
     store.write_json(paths[1], report.figures(calibration, quality, judged))
     for name, picture in pictures(calibration, quality).items():

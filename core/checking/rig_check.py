@@ -21,11 +21,12 @@ from ..geometry.rig import Rig, read_rig
 from ..geometry.view_angles import WIDEST_DEG, axis_angles_deg, no_view_alike
 from ..take.take import Take
 from .findings import Cause, Checked, Finding, doubtful, wrong
-from .view_matches import PairMatches
+from .view_matches import PairMatches, third_views
 
 FOCAL = (0.4, 12.0)  # of the image's longer side: 103° and 5° of view
 OFF_CENTRE = 0.2  # of the image's longer side
 FAR_APART_M = 100.0  # longer than any hall
+NEAR_M = 0.01  # between all cameras
 SAME_PLACE = 0.005  # of the longest base
 MOST_COMPARED = 40  # cameras, each with every other one
 LARGE_SIGMA0_PX = 1.0
@@ -91,8 +92,14 @@ def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
 
 
 def unit_findings(rig: Rig) -> list[Finding]:
-    """Cameras further apart than any hall is long: their positions are in another unit than the file states."""
+    """Cameras further apart than any hall is long, or nearer to each other than their lenses are wide: their positions are in another unit
+    than the file states."""
     longest = max(_bases(rig.cameras).values(), default=0.0)
+    if 0 < longest < NEAR_M:
+        sentence = (
+            f"The cameras are only up to {1000 * longest:.2g} mm apart: rig.toml seems to be in metres, and `unit` to be another one."
+        )
+        return [wrong(Cause.UNIT, sentence, 'Write unit = "m" under [metadata] of rig.toml, or the unit that it is in.', base_m=longest)]
     if longest < FAR_APART_M:
         return []
     sentence = f"The cameras are up to {longest:.0f} m apart: rig.toml seems to be in millimetres or centimetres, not in metres."
@@ -197,6 +204,8 @@ SAME_PLACE_PX = 0.7  # two views are identical when so many matches are displace
 SAME_SHARE = 0.8  # of the matches
 CLICKS_CONFIRM = 0.5  # times the distance of the matches: clicks that are nearer than that confirm the rig
 MOST_PERMUTED = 5  # views of which every order is tried; of more, every pair is exchanged
+MOVED_PX = 2.0  # along the epipolar lines of a third view; sound rigs have 0.1, with real cameras up to 1.1, and 1 cm makes 2 to 16
+MOVED_SPREADS = 2.0  # of the median deviations: a moving person of a late view has larger ones
 STALE_PX = 1.0  # median distance from the epipolar lines; a sound rig has 0.4 to 0.8
 
 
@@ -300,6 +309,26 @@ def stale_finding(distance_px: dict[str, float]) -> list[Finding]:
             "not quite fit this footage.",
             "A camera may have been knocked or refocused since; calibrate again.",
             miss_px=distance_px[worst],
+        )
+    ]
+
+
+def moved_findings(pairs: Sequence[PairMatches], cameras: Sequence[Camera], names: Sequence[str]) -> list[Finding]:
+    """A camera that was moved along its base: every pair of views agrees with the rig, but not three views with each other."""
+    usable = [own for p in pairs if (own := p.consistent()) is not None]
+    off = [t for t in third_views(usable, cameras) if abs(t.along_px) > max(MOVED_PX, MOVED_SPREADS * t.spread_px)]
+    if not off:
+        return []
+    worst = max(off, key=lambda t: abs(t.along_px))
+    a, b, c = (names[k] for k in worst.views)
+    return [
+        doubtful(
+            Cause.STALE_CALIBRATION,
+            f"Points that views {a} and {b} place in space lie {abs(worst.along_px):.1f} px off in view {c}, along the epipolar lines "
+            f"(median of {worst.points}), although every two of these views agree: the distances of the cameras are not as in rig.toml.",
+            "A camera may have been moved towards another one or refocused since; calibrate again.",
+            along_px=worst.along_px,
+            points=worst.points,
         )
     ]
 

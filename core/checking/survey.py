@@ -218,9 +218,11 @@ def _repeated(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
     """Frames that differ from the frame before by less than the noise: a camera, or a conversion, repeated an image."""
     findings = []
     for k, name in enumerate(names):
-        usual = float(np.nanmedian(figures.energy[k])) if len(figures.frames) >= FEWEST_FRAMES else 0.0
+        shown = figures.spread[k] >= BLANK_SPREAD
+        known = figures.energy[k][shown & np.roll(shown, 1) & np.isfinite(figures.energy[k])]  # a black image differs from every other one
+        usual = float(np.median(known)) if len(figures.frames) >= FEWEST_FRAMES and len(known) else 0.0
         with np.errstate(invalid="ignore"):
-            same = (figures.energy[k] < REPEATED * usual) & (figures.spread[k] >= BLANK_SPREAD)
+            same = (figures.energy[k] < REPEATED * usual) & shown
         if usual > 0 and same.any():
             findings.append(_repeats(name, figures.frames[int(np.argmax(same))], int(same.sum()), len(same)))
     return findings

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..body.model_file import read_model
+from ..fitting.inputs.take_inputs import clicks_of_no_joint
 from ..fitting.settings import START_ALONE, FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -28,11 +29,11 @@ from .rig_check import (
     agreeing_share,
     clicked_pairs,
     geometry_findings,
+    moved_findings,
     rig_distances,
     rig_findings,
     same_views,
     stale_finding,
-    unit_findings,
     wide_findings,
 )
 from .survey import frozen_view, gap_findings, picture_findings, rate_findings, survey
@@ -47,29 +48,35 @@ LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joint
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself.
+    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself. Clicks that the body does not have.
 
     Raises:
         InputError: there is no such body model.
     """
+    foreign = [remark(Cause.CLICKS, sentence) for sentence in clicks_of_no_joint(take)]
     if take.joints_model is None or take.keypoints:
-        return []
+        return foreign
     joints = read_model(take.joints_model).skeleton.joint_names
     clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
     if not clicked and take.body_model in START_ALONE:
-        return []
+        return foreign
     if not clicked:
         sentence = (
             f"No joint of the body “{take.body_model}” is clicked. It starts by itself only where the whole person is visible; "
             "otherwise the result will have surface and tracks, but no body."
         )
-        return [doubtful(Cause.NO_CLICKS, sentence, advice)]
+        return [*foreign, doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
+    few = {*joints} <= {name for names in LIMBS.values() for name in (*names, "toe.R", "toe.L")}
+    missing = [name for limb, names in LIMBS.items() if few and {*names} <= {*joints} for name in names if name not in clicked]
+    if not bare and missing:
+        sentence = f"Not clicked in two views: {', '.join(missing)}. The fit has to find where the limb ends or bends."
+        return [*foreign, remark(Cause.FEW_CLICKS, sentence, advice)]
     if not bare:
-        return []
+        return foreign
     sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to find their pose."
-    return [doubtful(Cause.FEW_CLICKS, sentence, advice)]
+    return [*foreign, doubtful(Cause.FEW_CLICKS, sentence, advice)]
 
 
 def seed_findings(footage: Footage) -> list[Finding]:
@@ -184,6 +191,8 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         without_time = rig_distances(pairs, footage.rig.cameras, names)  # for views whose time offset cannot be estimated
         distance = {o.view: without_time[o.view] for o in offsets if o.view in without_time and not o.doubtful}
         findings += stale_finding(distance | {o.view: o.distance_px for o in offsets if math.isfinite(o.distance_px)})
+        if not any(o.doubtful for o in offsets):
+            findings += moved_findings(pairs, footage.rig.cameras, names)
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return findings, figures
 
@@ -264,7 +273,8 @@ def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
 
 
 def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
-    """Views that are identical, swapped or frozen, or the rig of another recording, from the first frames: about a second in every run.
+    """Views that are identical, swapped or frozen, a rig that is impossible or of another recording, from the first frames: about a second
+    in every run.
 
     Raises:
         InputError: an image cannot be read.
@@ -274,7 +284,7 @@ def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
     frozen = [frozen_view(name) for name in frozen_views(footage, frame, images)]
     pairs = match_views([[rows.rows(image) for image in images]], rows)
     return same_views(pairs, names) or [
-        *unit_findings(footage.rig),
+        *geometry_findings(footage.rig),
         *frozen,
         *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px),
     ]

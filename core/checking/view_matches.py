@@ -13,6 +13,7 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.fundamental import fundamental_matrix
+from ..geometry.robust import finite_median
 from ..geometry.rotation import cross_matrix
 from ..images.interlace import RowGrid
 
@@ -23,6 +24,7 @@ INLIER_PX = 2.0  # distance from a fundamental matrix
 MINIMAL_MATCHES = 7  # that a fundamental matrix always fits
 INLIER_SHARE = 0.6  # of the other matches
 FEWEST_MATCHES = 24  # distinct ones, of a pair
+DEEPER = 1.01  # factor of a depth, to find in which direction its point moves in another view
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -88,12 +90,16 @@ def epipolar_distance_px(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndar
 
 def in_front(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.ndarray:
     """(m,) whether the rays come closest to each other in front of both cameras."""
+    return np.asarray((_depth(a, b, xa_px, xb_px) > 0) & (_depth(b, a, xb_px, xa_px) > 0))
+
+
+def _depth(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.ndarray:
+    """(m,) depths in a where its rays come closest to those of b."""
     da, db = a.rays(xa_px), b.rays(xb_px)
     base = b.centre_m - a.centre_m
     aa, bb, ab = (da * da).sum(axis=1), (db * db).sum(axis=1), (da * db).sum(axis=1)
-    pa, pb = da @ base, db @ base
     determinant = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)
-    return np.asarray(((bb * pa - ab * pb) / determinant > 0) & ((ab * pa - aa * pb) / determinant > 0))
+    return np.asarray((bb * (da @ base) - ab * (db @ base)) / determinant)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -131,6 +137,41 @@ class PairMatches:
         """The `inliers`."""
         rows = self.inliers()
         return None if rows is None else PairMatches(i=self.i, j=self.j, xi_px=self.xi_px[rows], xj_px=self.xj_px[rows])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ThirdView:
+    """By how much a third view misses the points of two: the median along its epipolar lines, which no pair of views shows."""
+
+    views: tuple[int, int, int]  # the third one last
+    points: int
+    along_px: float  # signed
+    spread_px: float  # median of the deviations from it
+
+
+def third_views(pairs: Sequence[PairMatches], cameras: Sequence[Camera]) -> list[ThirdView]:
+    """Every three views that show enough of the same points: those of a and b, intersected, in c. `pairs` are consistent."""
+    of_pair = {(p.i, p.j): (p.xi_px, p.xj_px) for p in pairs} | {(p.j, p.i): (p.xj_px, p.xi_px) for p in pairs}
+    found = []
+    for (a, b), (xa, xb) in of_pair.items():
+        for c in (c for c in range(len(cameras)) if c > b and (a, c) in of_pair):
+            row = {tuple(xy): n for n, xy in enumerate(of_pair[a, c][0].tolist())}
+            both = [(m, row[tuple(xy)]) for m, xy in enumerate(xa.tolist()) if tuple(xy) in row]
+            if len(both) >= FEWEST_MATCHES:
+                m, n = np.array(both).T
+                off = _along_px(cameras[a], cameras[b], cameras[c], xa[m], xb[m], of_pair[a, c][1][n])
+                middle = finite_median(off, 0.0)
+                spread = finite_median(np.abs(off - middle), 0.0)
+                found.append(ThirdView(views=(a, b, c), points=len(m), along_px=middle, spread_px=spread))
+    return found
+
+
+def _along_px(a: Camera, b: Camera, c: Camera, xa_px: np.ndarray, xb_px: np.ndarray, xc_px: np.ndarray) -> np.ndarray:
+    """How far (m,) [px] points of a and b lie from where c shows them, in the direction in which they move there with their depth in a."""
+    depth = _depth(a, b, xa_px, xb_px)
+    here, deeper = (c.project(a.points_at_depth(xa_px, factor * depth)) for factor in (1.0, DEEPER))
+    direction = (deeper - here) / np.linalg.norm(deeper - here, axis=1, keepdims=True)
+    return np.asarray(((xc_px - here) * direction).sum(axis=1))
 
 
 def match_views(images: Sequence[Sequence[np.ndarray]], rows: RowGrid) -> list[PairMatches]:

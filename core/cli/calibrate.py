@@ -12,7 +12,7 @@ from ..calibration.bars import BarObservations
 from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
-from ..calibration.calibrate import Start, Starts, calibrate_rig, measure_bar, open_bar, open_boards, write_report
+from ..calibration.calibrate import Start, Starts, calibrate_rig, check_report, measure_bar, open_bar, open_boards, write_report
 from ..calibration.rig_files import FOLDERS, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
@@ -20,7 +20,9 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
-from ..take.bar_file import write_bar
+from ..results.listed_files import check_files
+from ..results.outputs import check_output, check_replaceable
+from ..take.bar_file import FIRST, bar_path, write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
 
@@ -112,6 +114,13 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     if not args.format and args.out.is_dir():
         raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
+    if not args.format and (board is None or args.with_board is not None):
+        check_output(bar_path(args.out), [path for path in (args.points, args.like) if path is not None])
+        check_replaceable(bar_path(args.out), *FIRST)
+    if args.report:
+        check_report(args.report)
+    if args.format:
+        check_files(args.out, FOLDERS.get(args.format, ()))
     world = _world(args)
     result = calibrate_rig(_observed(args, board, monitor), monitor, focal_px=args.focal_px, lens=Lens(args.lens), world=world)
     written = [args.out]

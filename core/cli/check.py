@@ -28,7 +28,7 @@ def check(subject: Path, monitor: Monitor) -> Checked:
         InputError: it is none of them.
     """
     if (subject / "run.json").is_file():
-        from ..checking.run_check import check_run
+        from ..run.check import check_run
 
         return check_run(subject, monitor)
     if (subject / "take.toml").is_file() or (subject.name == "take.toml" and subject.is_file()):

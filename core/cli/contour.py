@@ -7,10 +7,12 @@ from ..foundation.progress import Monitor
 from ..foundation.settings import nearest_name
 from ..geometry.rig import read_rig
 from ..images.sequence import read_image
+from ..results.outputs import check_replaceable
 from ..run import pipeline, take_run
 from ..run.outlines import MEASURED_SURFACE, Start, write_contour
 from ..surface.measure import NothingMeasured
 from ..take.take import Take, read_take
+from ..tracking.contour import HEAD
 from ..tracking.point_tables import read_polygon
 from .arguments import frame_range, overrides
 
@@ -56,7 +58,7 @@ def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start:
     it.
 
     Raises:
-        InputError: there is no such view, or nothing to start from.
+        InputError: there is no such view, nothing to start from, or its file is not of an earlier call.
     """
     _check_views(job.footage.take, views)
     if len(views) > 1 and (start.polygon is not None or start.background is not None):
@@ -64,6 +66,8 @@ def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start:
     if start.body and not job.results.path("skin").is_dir():
         folder = job.results.folder
         raise InputError(f"{folder} has no fitted body with a skin for these frames and settings; run `tricap fit` first.")
+    for name in views:
+        check_replaceable(job.results.path("contours", f"{name}.csv"), HEAD)
     own_start = start.polygon is not None or start.background is not None or start.body
     if job.trajectories is None and start.background is None and (job.settings["fitting"].use_surface or not own_start):
         _track_if_possible(job, monitor, own_start)

@@ -9,6 +9,7 @@ from ..run.joints import joints_of_take, pixels_of, write_joints_as_clicks
 from ..run.network_joints import joints_by_file, write_network_joints
 from ..take.footage import open_take
 from ..take.take import read_take
+from ..take.writing import COPIED, has_comments
 from .arguments import overrides
 
 
@@ -25,6 +26,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     certain = start.probability >= limit
     if args.write and not certain:
         raise InputError(f"Nothing was written. {start.question}")
+    commented = has_comments(footage.take.folder)
     written = args.write and write_joints_as_clicks(footage.take.folder, start.frame, joints)
     if args.json:
         table = {
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     lines += [f"{name:<12}" + "  ".join(f"{view} ({x:.1f}, {y:.1f})" for view, (x, y) in at.items()) for name, at in joints.items()]
     lines += [f"Left to the other frames: {', '.join(start.unsure)}."] if start.unsure else []
     lines += [] if certain else [start.question]
-    return [*lines, *([f"{footage.take.folder / 'take.toml'} has them as clicks."] if written else [])]
+    return [*lines, *([f"{footage.take.folder / 'take.toml'} has them as clicks.{COPIED if commented else ''}"] if written else [])]
 
 
 def _by_network(args: argparse.Namespace, monitor: Monitor) -> list[str]:

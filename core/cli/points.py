@@ -14,12 +14,14 @@ from ..foundation.progress import Monitor
 from ..report.pictures import png
 from ..report.point_pictures import paths_in_space, paths_over_footage
 from ..results.folder import Results, check_inside, check_separate_folder
+from ..results.listed_files import PICTURES, check_files, list_files
+from ..results.outputs import check_replaceable
 from ..run import take_run
 from ..run.settings import settings_of
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from ..tracking.key_points import KeyPoints, track_key_points
-from ..tracking.point_tables import ChosenPoints, read_points, write_key_points
+from ..tracking.point_tables import IMAGES_HEAD, SPACE_HEAD, ChosenPoints, read_points, write_key_points
 from ..tracking.settings import TrackStatus
 from ..tracking.track import TrackingRules
 from .arguments import frame_range, overrides
@@ -34,9 +36,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     take = read_take(args.take)
     settings = settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), frame_range(args.frames)
-    check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(args.out, take.folder, (path for s in footage.sequences for path in s.files()))
     for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):
-        check_separate_folder(folder, take.folder, (s.files()[0] for s in footage.sequences))
+        check_separate_folder(folder, take.folder, (path for s in footage.sequences for path in s.files()))
+        check_files(folder, PICTURES)
         if folder != args.pictures:
             check_inside(folder, real_path(args.pictures))
     footage = footage if frames is None else take_run.only_frames(footage, frames)
@@ -46,6 +49,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     points = _by_name(read_points(args.points, with_views=True), footage, args.points)
     views = tuple(c.name for c in footage.rig.cameras)
     with Results(args.out).opened() as results:
+        check_replaceable(results.path("points3d.csv"), SPACE_HEAD)
+        check_replaceable(results.path("points2d.csv"), IMAGES_HEAD)
         tracked = follow_points(footage, points, first, settings, monitor)
         write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
         if args.pictures is not None:
@@ -77,12 +82,15 @@ def follow_points(
 
 def _draw(folder: Path, footage: Footage, names: tuple[str, ...], tracked: KeyPoints, monitor: Monitor) -> None:
     """Write a picture per frame and view, and paths.png, the paths in space."""
+    in_space = paths_in_space(names, tracked, footage.rig.cameras[footage.take.reference])
+    list_files(folder, PICTURES, ["paths.png"] if in_space is not None else [])
+    for camera in footage.rig.cameras:
+        list_files(folder / camera.name, PICTURES, [f"{frame:04d}.png" for frame in tracked.frames])
     for t, frame in enumerate(tracked.frames.tolist()):
         monitor.step("pictures", t, len(tracked.frames))
         for k, (grey, camera) in enumerate(zip(footage.read_whole(frame), footage.rig.cameras)):
             picture = paths_over_footage(grey, names, tracked.xy_px[:, :, k], t)
             store.write_bytes(folder / camera.name / f"{frame:04d}.png", png(picture))
-    in_space = paths_in_space(names, tracked, footage.rig.cameras[footage.take.reference])
     if in_space is not None:
         store.write_bytes(folder / "paths.png", png(in_space))
 

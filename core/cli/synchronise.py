@@ -7,6 +7,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..synchronising.synchronise import synchronise, write_starts
 from ..take.take import read_take
+from ..take.writing import COPIED, has_comments
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -22,7 +23,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError(" ".join(["Nothing was written." if args.write else "No view was found.", *map(str, lost)]))
     args.exit_code = 2 if lost else 0
     args.always_shown = [str(timing) for timing in lost]
+    commented = has_comments(take.folder)
     written = args.write and write_starts(take.folder, timings)
     if args.json:
         return [json.dumps({timing.view: timing.to_table() for timing in timings}, indent=1)]
-    return [*map(str, timings), *([f"{take.folder / 'take.toml'} has them."] if written else [])]
+    return [*map(str, timings), *([f"{take.folder / 'take.toml'} has them.{COPIED if commented else ''}"] if written else [])]

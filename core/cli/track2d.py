@@ -14,6 +14,7 @@ from ..images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
 from ..matching.least_squares import MatchingSettings
 from ..report.pictures import png
 from ..report.point_pictures import paths_over_footage
+from ..results.listed_files import PICTURES, check_files, list_files
 from ..run.settings import Overrides
 from ..tracking.planar import PlanarTracks, track_planar
 from ..tracking.point_tables import ChosenPoints, read_points, write_planar
@@ -39,6 +40,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_not_read("--out", args.out, args.points, args.sequence)
     if args.pictures is not None:
         check_not_read("--pictures", args.pictures, *{path.parent for path in sequence.files()[:1]})
+        check_files(args.pictures, PICTURES)
     frames = range(*(frame_range(args.frames) or (0, sequence.count)))
     if not frames or frames[0] < 0 or frames[-1] >= sequence.count:
         raise InputError(f"--frames {args.frames} are not among the frames 0 to {sequence.count - 1} of {args.sequence}.")
@@ -107,6 +109,7 @@ def _check_inside(points: ChosenPoints, image: np.ndarray, path: Path) -> None:
 
 def _draw(folder: Path, sequence: ImageSequence, points: ChosenPoints, tracks: PlanarTracks, monitor: Monitor) -> None:
     """Write a picture per frame: the points with their names and paths, joined by lines."""
+    list_files(folder, PICTURES, [f"{frame:04d}.png" for frame in tracks.frames])
     for t, frame in enumerate(tracks.frames.tolist()):
         monitor.step("pictures", t, len(tracks.frames))
         picture = paths_over_footage(sequence.read(frame), points.names, tracks.xy_px, t, points.joined)

@@ -30,6 +30,10 @@ MOVIE_BYTES = 1 << 42  # decoded piece by piece
 
 MOST_KEY_PARTS = 32  # of a dotted TOML key, for whose parts tomllib needs quadratic time
 LONGEST_PATTERN = 1000  # characters of a pattern of files
+WILDCARDS = frozenset("*?[")
+MARKS_OF_A_RUN = {"run.json": b'{"format":"tricap-run"', ".tricap-lock": b'{"pid":'}  # how these files begin, without white space
+LONGEST_MARK = 100  # bytes
+LISTED_FILES = ".tricap-files"  # a list of the files that a command wrote into a folder, such as pictures
 DEEPEST = 64  # tables and lists in each other
 TOO_DEEP = f"more than {DEEPEST} tables and lists in each other"
 WHOLE_BITS = 63  # of a whole number, as TOML has it
@@ -125,7 +129,8 @@ def matching(folder: Path, pattern: str) -> list[Path]:
     """What a pattern of files names in a folder; nothing where it is no pattern.
 
     Every folder is searched once for each part of the pattern: two links to the folder itself give “*/*/*/*.png” sixteen names for it,
-    and twenty-five parts more names than anybody can wait for.
+    and twenty-five parts more names than anybody can wait for. A wildcard does not enter the folder of a run, or of our pictures:
+    these are no footage.
     """
     if len(pattern) > LONGEST_PATTERN:
         return []
@@ -133,11 +138,33 @@ def matching(folder: Path, pattern: str) -> list[Path]:
     folders = [folder]
     try:
         for part in parts[:-1]:
-            inside = sorted((path for outer in folders for path in outer.glob(part) if path.is_dir()), reverse=True)
+            inside = sorted((path for outer in folders for path in _folders(outer, part)), reverse=True)
             folders = list({_identity(path): path for path in inside}.values())
         return [path for outer in folders for path in outer.glob(parts[-1])]
     except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
         return []
+
+
+def _folders(outer: Path, part: str) -> list[Path]:
+    """The folders that a part of a pattern names; of a pattern with wildcards without those that we wrote, and what is inside these."""
+    found = [path for path in outer.glob(part) if path.is_dir()]
+    if not WILDCARDS.intersection(part):
+        return found
+    ours = {path for path in found if path != outer and (is_of_a_run(path) or _begins(path / LISTED_FILES, b"["))}
+    return [path for path in found if not ours.intersection((path, *path.parents))]
+
+
+def is_of_a_run(folder: Path) -> bool:
+    """Whether a run wrote its results into a folder, or is writing them: it has our run.json or our lock."""
+    return any(_begins(folder / name, start) for name, start in MARKS_OF_A_RUN.items())
+
+
+def _begins(path: Path, start: bytes) -> bool:
+    try:
+        with opened(path, JSON_BYTES) as file:
+            return b"".join(file.read(LONGEST_MARK).split()).startswith(start)
+    except OSError:
+        return False
 
 
 def _identity(path: Path) -> tuple[int, int] | Path:

@@ -103,13 +103,14 @@ def frame_time_s(frame: float | np.ndarray, fps: float) -> float | np.ndarray:
 
 
 MADE_FROM = "made_from.json"
+UNFINISHED = {"count": 0}  # in it, while the pictures are written
 
 
 def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, monitor: Monitor | None = None) -> tuple[Path, ...]:
     """FOLDER/000000.png …, an image of every field of a sequence, written unless they exist.
 
     Raises:
-        InputError: an image cannot be read, the folder or its parent is a link, or the folder cannot be written to.
+        InputError: an image cannot be read, the folder or its parent is a link, the folder has other pictures, or it cannot be written to.
         Cancelled: the monitor was cancelled; the next call writes all images.
     """
     paths = tuple(folder / f"{n:06d}.png" for n in range(fields.per_image * sequence.count))
@@ -119,9 +120,11 @@ def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, m
     link = next((path for path in (folder, folder.parent) if path.is_symlink()), None)
     if link is not None:
         raise InputError(f"{link} is a link, through which pictures of the fields would be written elsewhere; remove the link.")
+    other = None if record.is_file() else next(folder.glob("*.png"), None)
+    if other is not None:
+        raise InputError(f"{other} is not a picture of a field that Tricap wrote; move it, or choose another folder for the results.")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        record.unlink(missing_ok=True)
+        store.write_json(record, UNFINISHED)  # also makes the folder; whoever is killed now leaves it marked as ours
         for n, path in enumerate(paths):
             if monitor is not None:
                 monitor.step("fields", n, len(paths))

@@ -292,6 +292,7 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Correct `images` there."
         raise InputError(f"View {view} has no images: nothing in {folder} matches “{pattern}” of take.toml. {hint}")
     if not gaps:
+        _check_doubles(paths, view)
         _check_numbering(paths, view)
     for path in paths:
         _check_signature(path)
@@ -402,6 +403,20 @@ def _check_signature(path: Path) -> None:
 def natural(path: Path) -> list[tuple[int, int, str]]:
     """A key to sort paths by, 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
+
+
+def _check_doubles(paths: tuple[Path, ...], view: str) -> None:
+    """Refuse two images of one number, such as 7.png and 07.png, or 7.png and its copy “7 (1).png”: all later images would be late."""
+    for path, other in zip(paths, paths[1:]):
+        number = _to_number(min(path, other, key=lambda p: len(natural(Path(p.stem)))))
+        if number and path.parent == other.parent and all(natural(Path(p.stem))[: len(number)] == number for p in (path, other)):
+            raise InputError(f"View {view} has two images of number {number[-1][1]}: {path.name} and {other.name}; remove one of them.")
+
+
+def _to_number(path: Path) -> list[tuple[int, int, str]]:
+    """The key of a file's name up to its last number; empty without a number."""
+    key = natural(Path(path.stem))
+    return key[: max((n for n, part in enumerate(key, 1) if not part[0]), default=0)]
 
 
 def _check_numbering(paths: tuple[Path, ...], view: str) -> None:

@@ -174,8 +174,10 @@ def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) 
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
         lines = list(csv.reader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
+    except PermissionError as error:
+        raise InputError(f"Cannot read the table {path}: {error.strerror}; change its rights.") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read the table {path}: {error}; run the fit again.") from error
+        raise InputError(f"Cannot read the table {path}: {getattr(error, 'strerror', None) or error}; run the fit again.") from error
     if not lines:
         raise InputError(f"The table {path} is empty; run the fit again.")
     header, rows = lines[0], [row for row in lines[1:] if row]

@@ -48,22 +48,35 @@ WRITTEN = (
 
 
 def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
-    """Refuse to mix results with footage, because one could replace the other.
+    """Refuse to mix results with footage, because one could replace the other. `footage`: all its files.
 
     Raises:
-        InputError: OUT is a take, contains its footage or lies among its images, or the take lies where results are replaced.
+        InputError: OUT is a take, contains its footage or lies among its images, or take or footage lie where results are replaced.
     """
     where = bounded.real_path(out)
     advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
     if (where / "take.toml").exists():
         raise InputError(f"{out} is itself a take; {advice}")
-    for path in footage:
-        folders = {bounded.real_path(path.parent), bounded.real_path(path).parent}
+    replaced = [where / name for name in WRITTEN]
+    for path, folders in _folders_of(footage):
         among = path.suffix.lower() in IMAGE_ENDINGS and take is not None and bounded.real_path(take) not in folders
         if where in folders or (among and folders.intersection(where.parents)):
             raise InputError(f"{out} contains the footage {path.name}; {advice}")
-    if take is not None and any(bounded.real_path(take).is_relative_to(where / name) for name in WRITTEN):
+        if any(folder.is_relative_to(place) for folder in folders for place in replaced):
+            raise InputError(f"The footage {path} is inside {out}, where a run replaces files; choose another folder for the results.")
+    if take is not None and any(bounded.real_path(take).is_relative_to(place) for place in replaced):
         raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
+
+
+def _folders_of(footage: Iterable[Path]) -> list[tuple[Path, frozenset[Path]]]:
+    """The real folders of files, that of the name and that of the file which it leads to: one file for all that are in the same ones."""
+    real, found = dict[Path, Path](), dict[frozenset[Path], Path]()
+    for path in footage:
+        if path.parent not in real:
+            real[path.parent] = bounded.real_path(path.parent)
+        ends = {real[path.parent], bounded.real_path(path).parent if path.is_symlink() else real[path.parent]}
+        found.setdefault(frozenset(ends), path)
+    return [(path, folders) for folders, path in found.items()]
 
 
 def check_not_result(file: Path, out: Path) -> None:
@@ -237,13 +250,19 @@ def check_inside(path: Path, folder: Path) -> None:
 
 
 def _not_from_a_run(folder: Path) -> list[str]:
-    """Files and folders that have the name of a result, or `cache`, although no run has written to the folder.
+    """Files and folders that have the name of a result, `cache` or run.json, although no run has written to the folder.
 
-    A run that was stopped early leaves a cache, and a killed one its lock.
+    A run that was stopped early leaves a checkpoint, and a killed one its lock.
     """
-    cache = folder / "cache"
-    if (folder / "run.json").exists() or (folder / NAME).exists():
+    if bounded.is_of_a_run(folder) or _has_checkpoints(folder / "cache"):
         return []
-    if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
-        return []
-    return [name for name in ("cache", *RESULTS) if (folder / name).exists()]
+    found = [name for name in ("cache", "run.json", *RESULTS) if (folder / name).exists()]
+    return [name for name in found if name != "cache" or any(not p.is_dir() for p in (folder / name).rglob("*"))]
+
+
+def _has_checkpoints(cache: Path) -> bool:
+    """Whether a folder has our checkpoints, and nothing else."""
+    if not cache.is_dir() or not all(p.is_dir() for p in cache.iterdir()):
+        return False
+    files = [file for stage in cache.iterdir() for file in stage.iterdir()]
+    return all(file.suffix in (".npz", ".part") for file in files) and any(store.header_of(file) for file in files)

@@ -11,6 +11,7 @@ from ..take.footage_files import take_files
 from ..take.take import read_take
 from .folder import check_not_result, is_result
 
+LONGEST_START = 200  # bytes
 LEVELS = 4  # so far above a file its take is looked for
 
 
@@ -86,6 +87,23 @@ def check_outputs(values: dict[str, object], outputs: Sequence[str], *, may_be_r
         file = values.get(name)
         if isinstance(file, Path):
             check_output(file, inputs, may_be_rig=may_be_rig and name == "out")
+
+
+def check_replaceable(file: Path, *starts: str) -> None:
+    """Check that a file, if there is one, is of an earlier call, by how it begins (`starts`). Nobody gave its name.
+
+    Raises:
+        InputError: it is another one.
+    """
+    if not file.exists():
+        return
+    try:
+        with bounded.opened(file, bounded.TABLE_BYTES) as opened:
+            ours = opened.read(LONGEST_START).startswith(tuple(start.encode() for start in starts))
+    except OSError:
+        ours = False
+    if not ours:
+        raise InputError(f"{file} would be overwritten, and is not of an earlier call; rename it, or choose another name or folder.")
 
 
 def _is_there(path: Path) -> bool:

@@ -19,7 +19,7 @@ STAGE_FIGURES = {  # figures that a finished stage must have
 }
 SEEN = {"full": "the whole person is seen", "upper_body": "the images cut the person below"}  # why a model was chosen
 JOINTS = "it has the joints that are located"
-STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model")
+STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model", "surface")
 LARGEST_FIGURE = 1e12  # far above every figure of a run
 
 
@@ -30,7 +30,9 @@ def read_run(path: Path) -> dict[str, Any]:
         InputError: it is missing, damaged, or of another version.
     """
     run = store.read_json(path)
-    if not isinstance(run, dict) or run.get("format") != FORMAT or run.get("version") != VERSION:
+    if not isinstance(run, dict) or run.get("format") != FORMAT:
+        raise InputError(f"{path} was not written by Tricap; choose another folder for the results.")
+    if run.get("version") != VERSION:
         raise InputError(f"{path} was not written by this version of Tricap; choose another folder, or --restart.")
     invalid = next((name for name, kind in FIELD_TYPES.items() if name in run and not isinstance(run[name], kind)), None)
     invalid = invalid or _invalid_table(run) or _invalid_stage(run.get("stages", {}))

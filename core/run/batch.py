@@ -27,11 +27,13 @@ from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
 from ..results import blend_file
 from ..results.folder import check_inside, check_separate_folder
+from ..results.outputs import check_output
 from . import pipeline, take_run
 from .engine import Engine, dask_client
 from .settings import Overrides
 
 FORMAT, VERSION = "tricap-batch", 1
+SUMMARY = "batch.json"
 TOPIC = "tricap"  # of the workers' progress reports
 WAIT_S = 0.3  # interval at which the tasks are polled
 REPORT_S = 0.5  # between two progress reports of a worker
@@ -93,10 +95,11 @@ def out_folders(takes: Sequence[Path], folder: Path) -> tuple[list[Path], dict[i
     Names that differ only in capitals are the same, as on the disks of Windows and macOS. Also why some takes cannot have theirs.
 
     Raises:
-        InputError: FOLDER is a take, or no take can have its results in it.
+        InputError: FOLDER is a take or its footage, or no take can have its results in it.
     """
     folder, takes = real_path(folder), [real_path(take) for take in takes]
     check_separate_folder(folder)
+    check_output(folder / SUMMARY)
     same = Counter(take.name.casefold() for take in takes)
     names = [f"{take.parent.name}_{take.name}" if same[take.name.casefold()] > 1 else take.name for take in takes]
     outs, taken, refused = [folder / name for name in names], set[str](), dict[int, str]()
@@ -119,8 +122,13 @@ def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[s
     began = time.perf_counter()
     try:
         with take_run.open_run(Path(take), Path(out), overrides, restart=restart) as job:
-            pipeline.all_stages(job, Monitor(_reporter(take)))
-            _scene(job)
+            if pipeline.is_complete(job):
+                job.record["warnings"] = job.results.read_run().get("warnings", [])
+                if not blend_file.is_whole(job.results.path(blend_file.BLEND)):
+                    _scene(job)
+            else:
+                pipeline.all_stages(job, Monitor(_reporter(take)))
+                _scene(job)
         status, said = Status.DONE, _summary_of(job)
     except Exception as error:  # the edge of the worker: every error goes into the summary
         status, said = Status.INVALID_INPUT, sentence_of(error) or ""
@@ -213,7 +221,7 @@ def _write(folder: Path, engine: Engine, takes: Sequence[Path], outs: Sequence[P
     waiting = [asdict(outcomes[i]) if i in outcomes else {"take": str(takes[i]), "out": str(outs[i]), "status": "waiting"}
                for i in range(len(takes))]  # fmt: skip
     where = {"scheduler": engine.scheduler} if engine.scheduler else {"workers": engine.workers}
-    store.write_json(Path(folder) / "batch.json", {"format": FORMAT, "version": VERSION, **where, "takes": waiting})
+    store.write_json(Path(folder) / SUMMARY, {"format": FORMAT, "version": VERSION, **where, "takes": waiting})
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[str]:

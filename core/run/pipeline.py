@@ -36,6 +36,7 @@ from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out,
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, of_model, with_start
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.view_angles import no_view_alike
@@ -67,7 +68,7 @@ from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
 from .stages import CONTENT, STAGES
-from .take_run import Run, open_run
+from .take_run import SURFACE, Run, open_run
 from .workers import measure_at_once
 
 BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin", "outlines")  # of the fit, besides the report
@@ -104,7 +105,9 @@ def measure(run: Run, monitor: Monitor) -> None:
     run.warn(
         *check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor)
     )
-    run.finish_stage("measure", began, **surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean())))
+    run.note_surface(surface := store.digest(*(summary.key for summary in summaries)))
+    figures = surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean()))
+    run.finish_stage("measure", began, **figures, **{SURFACE: surface})
 
 
 def track(run: Run, monitor: Monitor) -> None:
@@ -147,6 +150,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         raise
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
+    run.warn_if_replaced()
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
     noted: dict[str, Any] = {"start": start_figures(given.start)} if given.start is not None else {}
     if run.footage.take.body_model == AUTO_BODY:
@@ -162,6 +166,7 @@ def fit(run: Run, monitor: Monitor) -> None:
 def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
+    run.warn_if_replaced()
     run.record["stages"].pop("report", None)  # a page does not report on the page before it
     shown = Report(
         footage=run.footage,

@@ -32,6 +32,11 @@ from .record import frame_table, new_record, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_keys, stage_keys, valid_stages
 
+SURFACE = "surface"  # of the measured stage in run.json: the digest of the keys of its frames, with the content of their images
+OTHER_IMAGES = "The images are not those that were measured before; tracks and body of these were removed."
+REPLACED = "Images or other files of the take were replaced or removed during this run, so its results do not fit each other. Run it again."
+CACHED_FITS = ("cache/fit", "cache/fit_again", "cache/body")
+
 
 @dataclass(kw_only=True)
 class Run:
@@ -43,6 +48,7 @@ class Run:
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
     content_keys: Mapping[str, str] = field(default_factory=dict)  # by the content of files in place of their times, where it was read
     body_key: str = ""  # that of the fit, whatever the skin
+    replaced: Callable[[], bool] = bool  # whether files that the surface was measured from are others than when the run began
     digests: FileDigests = field(default_factory=FileDigests)
     record: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # what the user should know of the folder, and not of its results
@@ -89,6 +95,21 @@ class Run:
         self.record["stages"] = {name: stages[name] for name in MADE_BY if name in stages}  # one made again is no longer the last
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
         self.results.write_run(self.record)
+
+    def warn_if_replaced(self) -> None:
+        """Warn where images, or other files that the surface was measured from, are no longer those with which the run began."""
+        if self.replaced():
+            self.warn(REPLACED)
+
+    def note_surface(self, digest: str) -> None:
+        """Drop what was made from another surface than the measured one, whose digest this is. The key of a stage has neither the content
+        of images nor parts of a second of their times."""
+        if self.record["stages"].get("measure", {}).get(SURFACE, digest) == digest:
+            return
+        after = STAGES[STAGES.index("measure") + 1 :]
+        self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in (*after, "report")}
+        names = [name for stage in after for name in STAGE_INPUTS[stage].files]
+        self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *CACHED_FITS])]
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
@@ -150,9 +171,17 @@ def open_run(
         clicked_depth(footage, name, at)
     if take.joints_model is not None:
         read_model(take.joints_model)
-    check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(out, take.folder, (path for s in footage.sequences for path in s.files()))
     check_pictured(footage.frames, pictures)
     keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
+    begun, opened = dict(settings), keys["measure"]
+
+    def replaced() -> bool:
+        try:
+            return stage_keys(footage, begun, Path(out))["measure"] != opened
+        except InputError:
+            return True
+
     with Results(out).opened() as results:
         notes = _remove_all(results) if restart else []
         before, digests = {} if restart else results.read_run(), FileDigests()
@@ -168,6 +197,7 @@ def open_run(
         if before:  # what was made otherwise must not stand beside the new
             notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
         run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+        run.replaced = replaced
         run.notes, run.digests = notes, digests
         with _with_errors(run.notes):
             if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile

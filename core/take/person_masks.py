@@ -78,19 +78,27 @@ def silhouette_files(footage: Footage, view: int, frames: Iterable[int]) -> list
     """The masks of a view for frames, or its one mask or background image; empty if it has none.
 
     Raises:
-        InputError: there are no masks, or too few.
+        InputError: there are no masks, too few, or they are the footage itself.
     """
     given, folder = footage.take.views[view], footage.take.folder
     if given.masks is None:
         name = given.mask or given.background
+        _check_not_footage(footage, view, [folder / given.mask] if given.mask else [])
         return [] if name is None else [folder / name]
     files, found = open_sequence(folder, images=given.masks, movie=None, view=f"{given.name} (masks)").files(), dict[Path, None]()
+    _check_not_footage(footage, view, files)
     for frame in frames:
         number = footage.number(view, frame)
         if not 0 <= number < len(files):
             raise InputError(f"View {given.name} has {len(files)} masks, but none for frame {frame}. There must be one for every image.")
         found[files[number]] = None
     return list(found)
+
+
+def _check_not_footage(footage: Footage, view: int, masks: Sequence[Path]) -> None:
+    if same := {*masks}.intersection(footage.sequences[view].files()):
+        name = footage.take.views[view].name
+        raise InputError(f"{min(same)} is an image of view {name}, and no mask; correct `mask` or `masks` of the view in take.toml.")
 
 
 def silhouette_sources(footage: Footage) -> str:

@@ -267,8 +267,8 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         body_model=body_model(folder, body.get("model"), where),
         locked=_locked(body.get("locked", []), where),
         limits=_limits(body.get("limits", {}), where),
-        clicks=_frame_clicks(table_of(table, "seeds", where), names, where),
-        keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
+        clicks=(clicks := _frame_clicks(table_of(table, "seeds", where), names, where)),
+        keyframes=_keyframes(tables_of(table, "keyframes", where), clicks, names, where),
         corrections=_corrections(tables_of(table, "corrections", where), names, where),
         keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
         settings=_settings(table, where),
@@ -316,12 +316,14 @@ def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
     return {name: (float(low), float(high)) for name, (low, high) in table.items()}
 
 
-def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[FrameClicks, ...]:
+def _keyframes(tables: list[Mapping[str, Any]], seeds: FrameClicks, views: tuple[str, ...], where: str) -> tuple[FrameClicks, ...]:
     for table in tables:
         check_keys(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
     keyframes = tuple(_frame_clicks(table, views, where) for table in tables)
     if len({k.frame for k in keyframes}) < len(keyframes):
         raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
+    if seeds.joints and any(k.joints and k.frame == seeds.frame for k in keyframes):
+        raise InputError(f"A [[keyframes]] of {where} is for frame {seeds.frame}, as [seeds.joints] is; write its joints there.")
     return tuple(sorted(keyframes, key=lambda k: k.frame))
 
 

@@ -1,11 +1,13 @@
 """Making and changing take.toml: it is checked, then written completely or not at all, and not written where nothing changes.
 
-Editors change the table of the file; keys that they do not change stay, but comments are lost.
+Editors change the table of the file; keys that they do not change stay. Comments are lost: a file that has some is copied before.
 """
 
 import errno
 import glob
 import json
+import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +22,9 @@ from .take import FORMAT, VERSION, Take, take_of_text
 Link = tuple[Path, Path]  # its path in the take's folder, and the footage that it leads to
 Table = dict[str, Any]
 DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # that a file may leave out
+STRING = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'')
+MOST_COPIES = 99
+COPIED = " The file with your comments was copied to take.toml.bak."
 ASSUMED_FPS = 25.0  # of footage that states no frame rate, where nobody says it either
 
 
@@ -65,8 +70,31 @@ def write_table(folder: Path, table: Table) -> bool:
     path = Path(folder) / "take.toml"
     if path.exists() and _essential(read_table(folder)) == _essential(table):
         return False
+    if path.is_symlink():
+        raise InputError(f"{path} is a link, which a file would replace; put a copy in its place, or change the take that it leads to.")
+    if has_comments(folder):
+        _copy(path)
     store.write_text(path, toml_text(table))
     return True
+
+
+def has_comments(folder: Path) -> bool:
+    """Whether FOLDER/take.toml has comments, which are lost when it is written: then the earlier file is copied to take.toml.bak."""
+    try:
+        return "#" in STRING.sub("", bounded.text_of(Path(folder) / "take.toml", bounded.TOML_BYTES))
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _copy(path: Path) -> None:
+    """Copy a file to NAME.bak, or to NAME.2.bak, … where that is another file."""
+    content = bounded.bytes_of(path, bounded.TOML_BYTES)
+    for number in range(1, MOST_COPIES + 1):
+        copy = path.with_name(f"{path.name}{f'.{number}' if number > 1 else ''}.bak")
+        if not os.path.lexists(copy):
+            store.write_bytes(copy, content)
+            return
+    raise InputError(f"{path.parent} has {MOST_COPIES} copies of {path.name} with comments; remove some of them (*.bak).")
 
 
 def renumbered(table: Table, per_image: int, before: int) -> Table:
@@ -85,6 +113,9 @@ def renumbered(table: Table, per_image: int, before: int) -> Table:
         made["seeds"] = {**made["seeds"], "frame": first(made["seeds"].get("frame", 0))}
     if "keyframes" in made:
         by_frame = {first(k["frame"]): {**k, "frame": first(k["frame"])} for k in reversed(made["keyframes"])}
+        seeds = made.get("seeds", {})
+        if seeds.get("joints") and (same := by_frame.pop(seeds["frame"], None)):
+            made["seeds"] = {**seeds, "joints": {**same.get("joints", {}), **seeds["joints"]}}
         made["keyframes"] = [by_frame[frame] for frame in sorted(by_frame)]
     if "corrections" in made:
         made["corrections"] = [{**c, **({"frame": first(c["frame"])} if "frame" in c else {"frames": span(c["frames"])})}

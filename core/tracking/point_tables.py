@@ -72,6 +72,9 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     return value
 
 
+SPACE_HEAD, IMAGES_HEAD = "frame,time_s,point,x,y,z,sigma,status", "frame,view,point,x,y"
+
+
 def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> None:
     """CSV of frame, point, x, y, sigma, correlation, status; a point that is not visible has empty cells, and the reason as its status.
 
@@ -125,7 +128,7 @@ def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: t
     Raises:
         InputError: a file cannot be written.
     """
-    lines, pixels = ["frame,time_s,point,x,y,z,sigma,status"], ["frame,view,point,x,y"]
+    lines, pixels = [SPACE_HEAD], [IMAGES_HEAD]
     for t, frame in enumerate(points.frames):
         for n, name in enumerate(map(_quoted, names)):
             cells = [f"{v:.6f}" if np.isfinite(v) else "" for v in (*points.xyz_m[t, n], points.sigma_m[t, n])]

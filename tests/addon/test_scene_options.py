@@ -43,6 +43,12 @@ def test_the_exact_skin_is_the_skin_of_every_frame(empty: ModuleType, small_run:
         assert np.abs(world_vertices(empty, empty.data.objects["Exact skin"]) - exact).max() < 1e-5
 
 
+def test_exact_skins_replace_no_file_of_another_scene(small_run: SmallRun, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "b.pc2").write_text("mine")
+    assert main(["scene", str(small_run.out), "--blend", str(tmp_path / "b.blend"), "--exact-skin"]) == 2
+    assert "would overwrite" in capfd.readouterr().err and (tmp_path / "b.pc2").read_text() == "mine"
+
+
 def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     from tricap.addon.scene.build import SceneOptions, build_scene
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ...foundation.errors import InputError
 from ...geometry.rig import Rig, check_cameras
+from ...results.listed_files import check_files, list_files
 from . import agisoft, colmap, opencv_files, openptv, toml_files
 from .reading import text_of
 
@@ -61,7 +62,7 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     """Write a rig in another tool's format; the files that were written.
 
     Raises:
-        InputError: the format is unknown, or cannot hold this rig.
+        InputError: the format is unknown, or cannot hold this rig; or files in the folder are not of an earlier call.
     """
     if name not in FORMATS:
         raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
@@ -71,4 +72,9 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     curved = [camera.name for camera in rig.cameras if camera.fisheye]
     if curved and name not in WITH_FISHEYE:
         raise InputError(f"{name} has no fisheye lens, as camera {curved[0]} has; choose one of {', '.join(WITH_FISHEYE)}.")
-    return FORMATS[name](Path(path), rig)
+    if name not in FOLDERS:
+        return FORMATS[name](Path(path), rig)
+    check_files(Path(path), FOLDERS[name])
+    written = FORMATS[name](Path(path), rig)
+    list_files(Path(path), FOLDERS[name], [file.name for file in written])
+    return written

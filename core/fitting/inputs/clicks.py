@@ -1,7 +1,9 @@
 """Clicked joints: their observations, their places in space, and whether the views agree."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from ...geometry.intersection import Intersection, doubtful_view, intersect_clic
 from ...geometry.rig import Rig
 from ..observations import ClickedJoints, Observation
 from .fit_input import ClickedAt
+
+SAME_PX = 0.5  # clicks of two joints are nearer only by mistake
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +57,18 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_p
         cameras=tuple(cameras), joint=np.array(index, dtype=np.intp), xy_px=np.array(xy).reshape(-1, 2), sigma_px=sigma_px
     )
     return found, places
+
+
+def check_apart(joints: ClickedAt, frame: int) -> None:
+    """Check that no two joints of a frame were clicked at the same pixels, in all views of both.
+
+    Raises:
+        InputError: two were.
+    """
+    for (a, of_a), (b, of_b) in combinations(joints.items(), 2):
+        both = of_a.keys() & of_b.keys()
+        if len(both) > 1 and all(math.dist(of_a[view], of_b[view]) < SAME_PX for view in both):
+            raise InputError(f"{a} and {b} are clicked at the same pixels in frame {frame}; click each joint at its own place.")
 
 
 def initial_clicks(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence[Observation]) -> Clicks:

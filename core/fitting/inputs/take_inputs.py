@@ -17,13 +17,13 @@ from ...motion.formats.markers import Markers, read_points_csv
 from ...motion.formats.trc import read_trc
 from ...motion.retarget.points import joint_of
 from ...results.folder import Results
-from ...take.footage import Footage
+from ...take.footage import Footage, footage_frames
 from ...take.sources import KeypointSource
 from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import START_ALONE, FitSettings
-from .clicks import initial_clicks, read_clicks
+from .clicks import check_apart, initial_clicks, read_clicks
 from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
@@ -82,13 +82,15 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     """Check that clicks and degrees of freedom are those of the take's body model, before hours of computation.
 
     Raises:
-        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints of a limb are clicked.
+        InputError: the model has no such degree of freedom, clicks contradict each other or coincide, or a limb has too few of them.
     """
     take, clicks = footage.take, clicks_in(footage)
     if missing_for_fit(footage):
         return
     model = with_limits(read_model(str(take.joints_model)), take.limits, take.locked)
     names = model.skeleton.joint_names
+    for frame, at in clicks.items():
+        check_apart({name: views for name, views in at.items() if name in names}, frame)
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if places and not take.keypoints and take.body_model not in START_ALONE:
         best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
@@ -101,15 +103,35 @@ def missing_for_fit(footage: Footage) -> str:
 
 
 def clicks_left_out(footage: Footage) -> list[str]:
-    """Warnings about clicked joints outside the footage's frames."""
+    """Warnings about clicked joints outside the footage's frames, and about those that the body does not have."""
     outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
-    if not outside or missing_for_fit(footage):
+    if missing_for_fit(footage):
         return []
+    foreign = clicks_of_no_joint(footage.take)
+    if not outside:
+        return foreign
     begins = "; the fit begins at other clicks or keypoints, or by itself" if footage.take.clicks.frame in outside else ""
     return [
         f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
-        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."
+        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}.",
+        *foreign,
     ]
+
+
+def clicks_of_no_joint(take: Take) -> list[str]:
+    """A warning about clicked joints that the take's body model does not have.
+
+    Raises:
+        InputError: there is no such body model.
+    """
+    if take.joints_model is None:
+        return []
+    joints = read_model(take.joints_model).skeleton.joint_names
+    foreign = [f"{name} (frame {s.frame})" for s in _with_joints(take) for name in s.joints if name not in joints]
+    has = f"the body “{take.body_model}” has only {', '.join(joints)}"
+    return (
+        [f"The clicks of {', '.join(foreign)} are not used: {has}. Choose another `model` under [body], or remove them."] if foreign else []
+    )
 
 
 def _with_joints(take: Take) -> list[FrameClicks]:
@@ -150,7 +172,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
     """The keypoints of one [[keypoints]] entry, in the take's frames.
 
     Raises:
-        InputError: there are no such files, they cannot be read, or none of their names is a joint.
+        InputError: there are no such files, they cannot be read, or none of their names is a joint, or of their frames one of the take.
     """
     folder = footage.take.folder
     paths = sorted((p for p in bounded.matching(folder, source.files) if p.is_file()), key=lambda p: natural_order(p.name))
@@ -160,11 +182,24 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
         points = read_keypoints(paths)
         view = [v.name for v in footage.take.views].index(source.view)
         frames = footage.frames_of_images(view, points.number - source.offset_frames)
-        return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+        found = _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+        return _check_frames(footage, source, found)
     if len(paths) > 1:
         raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")
     markers = _markers(paths[0], source.axes)
-    return _places(source, markers.names, markers.frames - source.offset_frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+    frames = markers.frames - source.offset_frames
+    found = _places(source, markers.names, frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+    return _check_frames(footage, source, found)
+
+
+def _check_frames(footage: Footage, source: KeypointSource, found: JointPlaces) -> JointPlaces:
+    take = footage_frames(footage.take, footage.sequences)
+    if not ((found.frame >= take.start) & (found.frame < take.stop)).any():
+        raise InputError(
+            f"The keypoints “{source.files}” are of the frames {found.frame.min()} to {found.frame.max()} of the take, "
+            f"which has the frames {take.start} to {take.stop - 1}; correct `offset_frames` under [[keypoints]]."
+        )
+    return found
 
 
 def _markers(path: Path, axes: str | None) -> Markers:

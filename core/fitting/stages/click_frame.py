@@ -29,6 +29,7 @@ ALTERNATIONS, ALTERNATION_STEPS = 8, 5
 OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six led to the true arm in all of 20 trials
 MOST_OTHERS = 12  # starts for limbs without clicks: those that explain most points
 STAGE = "fit the click frame"
+FEW_JOINTS = 3  # that a sentence names
 DEPTH_SHIFT_M = 0.04  # of two more starts: with a short base, clicks are least precise along the view
 
 
@@ -59,9 +60,15 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
             )
         raise InputError(
             f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
-            "rig, or click in a frame where the limb was measured."
+            f"rig, or click in a frame where the limb was measured.{_not_clicked(fit)}"
         )
     return _shaped(fit, points, _with_lost_limbs(fit, points, best, best_score, parts[-1]), clicked.vector, monitor)
+
+
+def _not_clicked(fit: FitContext) -> str:
+    """A sentence that names the joints without a place in space, where they are few: without them a limb may point anywhere."""
+    names = [name for name, located in zip(fit.model.skeleton.joint_names, fit.clicks.located) if not located]
+    return f" Not clicked in two views: {', '.join(names)}." if 0 < len(names) <= FEW_JOINTS else ""
 
 
 def _shaped(fit: FitContext, points: CloudPoints, found: Solution, vector: np.ndarray, monitor: Monitor) -> Solution:

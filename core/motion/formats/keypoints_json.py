@@ -67,10 +67,10 @@ class ImagePoints:
 
 def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
     """Read one file of all images, or one file per image: its number is the one at the end of its name ("_keypoints" ignored), so that a
-    missing file shifts no other; files without such numbers are counted in the order of `paths`.
+    missing file shifts no other; files without such numbers, or with the same one, are counted in the order of `paths`.
 
     Raises:
-        InputError: a file cannot be read, is of another kind, or there is no person in any of them.
+        InputError: a file cannot be read, is of another kind, two are of one image, or there is no person in any of them.
     """
     people: list[tuple[int, list[Person]]] = []
     names: tuple[str, ...] = ()
@@ -94,7 +94,12 @@ def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
 def _numbers_of(paths: Sequence[Path]) -> Sequence[int]:
     found = [NUMBER.search(path.stem) for path in paths]
     numbers = [int(match[1]) for match in found if match]
-    return numbers if len(set(numbers)) == len(paths) else range(len(paths))
+    if len(numbers) < len(paths) or len(set(numbers)) == 1 < len(paths):  # the same everywhere: that of the camera
+        return range(len(paths))
+    for number, path in zip(numbers, paths):
+        if (first := paths[numbers.index(number)]) != path:
+            raise InputError(f"{first} and {path.name} are both of image {number}; remove one of them.")
+    return numbers
 
 
 def _tracked(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) -> ImagePoints:

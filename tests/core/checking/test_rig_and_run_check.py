@@ -13,6 +13,7 @@ import pytest
 from tricap.core.checking.findings import Cause
 from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
+from tricap.core.checking.take_check import check_first_frame
 from tricap.core.cli import main
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
@@ -24,6 +25,8 @@ from tricap.core.run import pipeline
 from tricap.core.run.take_run import open_run
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.synthetic.sample import unpack
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 SAMPLE = Path(__file__).resolve().parents[3] / "addon" / "sample.zip"
 
@@ -63,6 +66,7 @@ RIGS: dict[str, tuple[Rig, str]] = {
     "fisheye that folds": (with_first(fisheye=True, distortions=np.array([-4.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
     "fisheye that folds the middle": (with_first(fisheye=True, distortions=np.array([-30.0, 0.0, 0.0, 0.0, 0.0])), "input"),
     "no width": (with_first(affinity=np.array([-1.0, 0.0])), "input"),
+    "metres that are called millimetres": (Rig(cameras=tuple(replace(c, t_cam_world_m=c.t_cam_world_m / 1000) for c in CAMERAS)), "unit"),
     "poor by its own word": (Rig(cameras=CAMERAS, metadata={"verdict": "Poor: points within 20 mm."}), "poor calibration"),
     "red without a word for it": (
         Rig(cameras=CAMERAS, metadata={"verdict": "The adjustment did not converge.", "light": "red"}),
@@ -79,6 +83,15 @@ def test_a_fault_of_a_rig_is_named(name: str, tmp_path: Path) -> None:
     checked = check_rig(tmp_path / "rig.toml")
     assert cause in {f.cause for f in checked.findings}, checked.lines()
     assert json.dumps(checked.to_table(), allow_nan=False)
+
+
+def test_a_run_warns_of_cameras_at_the_same_position(arm_recording: Callable[..., Path]) -> None:
+    """Its warnings had nothing but a wrong unit."""
+    footage = open_take(read_take(arm_recording()))
+    assert check_first_frame(footage, 0) == []
+    a, b, c = footage.rig.cameras
+    rig = Rig(cameras=(replace(b, name=a.name), b, c))
+    assert "same place" in [finding.cause for finding in check_first_frame(replace(footage, rig=rig), 0)]
 
 
 def test_a_sound_rig_passes_and_a_broken_one_says_why(tmp_path: Path) -> None:

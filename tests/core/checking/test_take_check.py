@@ -434,6 +434,24 @@ def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int
         }
 
 
+@pytest.mark.parametrize("view", ["L", "C", "R"])
+def test_a_camera_that_was_moved_along_its_base_is_named(arm_recording: Record, tmp_path: Path, view: str) -> None:
+    """Every pair of views agrees with the rig still, and half of the points were lost."""
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    rig = read_rig(take / "rig.toml")
+    shift = 0.01 * (rig["R"].centre_m - rig["L"].centre_m) / np.linalg.norm(rig["R"].centre_m - rig["L"].centre_m)
+    moved = tuple(c if c.name != view else replace(c, t_cam_world_m=c.t_cam_world_m - c.R_cam_world @ shift) for c in rig.cameras)
+    write_rig(take / "rig.toml", replace(rig, cameras=moved))
+    found = [finding for finding in check_take(take, Monitor()).findings if finding.cause == Cause.STALE_CALIBRATION]
+    assert len(found) == 1 and "along the epipolar lines" in found[0].sentence, found
+
+
+def test_a_black_image_does_not_make_the_others_repeats() -> None:
+    energy, spread = np.array([[np.nan, 1.0, 60.0, 60.0]]), np.array([[50.0, 50.0, 0.0, 50.0]])
+    found = picture_findings(Survey(frames=range(4), energy=energy, spread=spread, bright=3 * spread, white=0 * spread), ("C",))
+    assert not [finding for finding in found if finding.cause == Cause.REPEATED_FRAMES]
+
+
 def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
     take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
     files = pictures(take, "R")

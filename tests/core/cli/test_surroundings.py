@@ -105,7 +105,7 @@ def surrounded(case: tuple[str, str], take: Path, outside: Path, capfd: Capture,
     (name, what), before, footage = case, contents(outside), contents(take)
     out = outside.parent / "out"
     out.mkdir()
-    (out / ".tricap-lock").write_text("")  # a killed run was here: the names may be those of its results
+    (out / ".tricap-lock").write_text('{"pid": 1}')  # a killed run was here: the names may be those of its results
     (out / name).unlink(missing_ok=True)
     PUT[what](out / name, outside)
     for argv in (["check", str(out)], ["measure", str(take), "--out", str(out)], ["contour", str(take), "--view", "L", "--out", str(out)]):

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tricap.core.checking.take_check import joint_findings
+from tricap.core.fitting.inputs.clicks import check_apart
 from tricap.core.fitting.inputs.take_inputs import clicks_in, clicks_left_out, joint_named, missing_for_fit, read_contours, read_source
 from tricap.core.foundation.errors import InputError
 from tricap.core.images.interlace import FieldLayout
@@ -21,9 +23,9 @@ from tricap.core.take.take import JOINTS, FrameClicks
 
 
 def _footage(folder):
-    views = (SimpleNamespace(name="L", offset_frames=0), SimpleNamespace(name="C", offset_frames=2))
-    take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout())
-    footage = SimpleNamespace(take=take, clocks=())
+    views = tuple(SimpleNamespace(name=name, offset_frames=n, has_clock=False) for name, n in (("L", 0), ("C", 2)))
+    take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout(), frames=(0, 12))
+    footage = SimpleNamespace(take=take, clocks=(), sequences=[SimpleNamespace(count=14)] * 2)
     footage.frames_of_images = partial(Footage.frames_of_images, footage)
     return footage
 
@@ -69,6 +71,29 @@ def test_a_missing_file_shifts_no_other(tmp_path) -> None:
     assert sorted(set(found.frame.tolist())) == [0, 1, 2]
 
 
+def test_two_files_of_one_image_are_refused(tmp_path) -> None:
+    """They were counted in the order of their names, so that every later file was shifted."""
+    _openpose(tmp_path / "kp", [_person(0)], [_person(4)], [_person(8)])
+    (tmp_path / "kp" / "C_1_keypoints.json").write_text((tmp_path / "kp" / "C_001_keypoints.json").read_text())
+    with pytest.raises(InputError, match="C_0*1_keypoints.json are both of image 1; remove"):
+        read_source(_footage(tmp_path), _source(files="kp/*.json", view="L"))
+    for number in range(4):
+        (tmp_path / "kp" / f"{number}_camera2.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": _person(number)}]}))
+    found = read_source(_footage(tmp_path), _source(files="kp/*_camera2.json", view="L"))
+    assert sorted(set(found.frame.tolist())) == [0, 1, 2, 3], "the number of the camera is not that of the image"
+
+
+def test_keypoints_of_no_frame_of_the_take_are_refused(tmp_path) -> None:
+    """They were ignored without a word."""
+    _openpose(tmp_path / "kp", [_person(0)], [_person(4)])
+    with pytest.raises(InputError, match="are of the frames -99 to -98 of the take, which has the frames 0 to 11; correct `offset_frames`"):
+        read_source(_footage(tmp_path), _source(files="kp/*.json", view="L", offset_frames=99))
+    (tmp_path / "p.csv").write_text("frame,time_s,RKnee x,RKnee y,RKnee z\n70,0,1,2,3\n73,1,1,2,3\n")
+    with pytest.raises(InputError, match="“p.csv” are of the frames 70 to 73 of the take"):
+        read_source(_footage(tmp_path), _source(files="p.csv"))
+    assert len(read_source(_footage(tmp_path), _source(files="p.csv", offset_frames=62)).frame) == 2
+
+
 @pytest.mark.parametrize(
     ("frames", "seeds", "keyframes", "used", "said"),
     [
@@ -84,6 +109,7 @@ def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, 
         clicks=FrameClicks(frame=seeds, joints=joints),
         keyframes=tuple(FrameClicks(frame=f, joints=joints) for f in keyframes),
         body_model="full",
+        joints_model="full",
         keypoints=(),
     )
     footage = SimpleNamespace(take=take, frames=frames)
@@ -91,6 +117,30 @@ def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, 
     assert not missing_for_fit(footage)  # without clicks the body starts by itself
     warnings = clicks_left_out(footage)
     assert len(warnings) == bool(said) and all(re.search(said, w) for w in warnings)
+
+
+def test_clicks_of_joints_that_the_body_does_not_have_are_named() -> None:
+    """They were ignored without a word."""
+    at = {"L": np.zeros(2), "C": np.zeros(2)}
+    clicks = FrameClicks(frame=2, joints={"shoulder.R": at, "elbow.R": at})
+    keyframes = (FrameClicks(frame=5, joints={"elbow.R": at, "knee.L": at}),)
+    take = SimpleNamespace(clicks=clicks, keyframes=keyframes, body_model="arm.R", joints_model="arm.R", keypoints=())
+    (said,) = clicks_left_out(SimpleNamespace(take=take, frames=range(9)))
+    assert said.startswith("The clicks of knee.L (frame 5) are not used: the body “arm.R” has only shoulder.R, elbow.R, wrist.R.")
+    assert said in [finding.sentence for finding in joint_findings(take)]
+    assert clicks_left_out(SimpleNamespace(take=SimpleNamespace(**{**vars(take), "joints_model": "full"}), frames=range(9))) == []
+
+
+def test_joints_that_are_not_clicked_or_clicked_at_one_place_are_named() -> None:
+    at = {"L": np.zeros(2), "C": np.ones(2)}
+    clicks = FrameClicks(frame=2, joints={"shoulder.R": at, "elbow.R": {view: xy + 40 for view, xy in at.items()}})
+    take = SimpleNamespace(clicks=clicks, keyframes=(), body_model="arm.R", joints_model="arm.R", keypoints=())
+    assert [finding.sentence for finding in joint_findings(take)][0].startswith("Not clicked in two views: wrist.R.")
+    check_apart(clicks.joints, 2)
+    with pytest.raises(
+        InputError, match="elbow.R and wrist.R are clicked at the same pixels in frame 2; click each joint at its own place"
+    ):
+        check_apart({**clicks.joints, "wrist.R": clicks.joints["elbow.R"]}, 2)
 
 
 def test_coco_annotations_and_results(tmp_path) -> None:

@@ -97,6 +97,23 @@ def test_patterns_are_matched_as_people_write_them(tmp_path: Path) -> None:
         assert sorted(found) == names, pattern[:50]
 
 
+@pytest.mark.parametrize(
+    "name, mark",
+    [("run.json", '{\n "format": "tricap-run",\n'), (".tricap-lock", '{"pid": 1, "host": "a"}\n'), (".tricap-files", '[\n "1.png"\n]\n')],
+)
+def test_a_wildcard_does_not_enter_a_folder_of_results(tmp_path: Path, name: str, mark: str) -> None:
+    """Pictures of a run in the take became footage, or masks, of the next run."""
+    for path in ("films/L/0.png", "results/fields/L/1.png", "results/report/2_L.png", "theirs/L/3.png"):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(b"")
+    (tmp_path / "results" / name).write_text(mark)
+    (tmp_path / "theirs" / name).write_text('{"format": "another"}')
+    expected = {"**/L/*.png": ["films/L/0.png", "theirs/L/3.png"], "**/*_L.png": [], "*/*/L/*.png": [],
+                "res*/fields/L/*.png": [], "results/fields/*/*.png": ["results/fields/L/1.png"]}  # fmt: skip
+    for pattern, names in expected.items():
+        assert sorted(path.relative_to(tmp_path).as_posix() for path in bounded.matching(tmp_path, pattern)) == names, pattern
+
+
 def test_dotted_keys_and_values_that_people_write_are_read() -> None:
     text = 'a.b."c.d".e = "1.2.3.4"\nf = [1.5, 2.5, [3.5]]\n[settings.matching]\npatch_px = 9223372036854775807\n'
     assert bounded.toml_of(text)["a"]["b"]["c.d"]["e"] == "1.2.3.4"

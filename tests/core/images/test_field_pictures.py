@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.images.interlace import BOTH, field_layout, field_pictures
+from tricap.core.images.interlace import BOTH, MADE_FROM, field_layout, field_pictures
 from tricap.core.images.sequence import open_sequence
 
 
@@ -47,3 +47,16 @@ def test_pictures_are_not_written_through_links(tmp_path: Path, link: str) -> No
     with pytest.raises(InputError, match="is a link"):
         field_pictures(sequence, field_layout(BOTH, "odd"), tmp_path / "fields" / "C")
     assert [path.name for path in (tmp_path / "elsewhere").rglob("*")] == ["C"]
+
+
+def test_pictures_of_somebody_else_are_not_replaced(tmp_path: Path) -> None:
+    """Footage that lay in a folder “fields” of the results was overwritten."""
+    for folder in ("C", "fields/C"):
+        (tmp_path / folder).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / folder / "000000.png"), np.full((6, 8), 7, np.uint8))
+    sequence = open_sequence(tmp_path, images="C/*.png", movie=None, view="C")
+    with pytest.raises(InputError, match="000000.png is not a picture of a field that Tricap wrote"):
+        field_pictures(sequence, field_layout(BOTH, "odd"), tmp_path / "fields" / "C")
+    assert [path.name for path in (tmp_path / "fields" / "C").iterdir()] == ["000000.png"]
+    (tmp_path / "fields" / "C" / MADE_FROM).write_text("{}")  # of a run that was killed
+    assert len(field_pictures(sequence, field_layout(BOTH, "odd"), tmp_path / "fields" / "C")) == 2

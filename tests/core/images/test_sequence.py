@@ -1,5 +1,6 @@
 """Reading footage: every kind of image, movies, natural order, gaps, and files that are not what they say."""
 
+import re
 import struct
 import tracemalloc
 import zlib
@@ -89,6 +90,29 @@ def test_natural_order(tmp_path: Path) -> None:
     for name in names:
         write(tmp_path / "odd" / name, np.zeros((8, 8), np.uint8))
     assert [p.name for p in open_sequence(tmp_path, images="odd/*", movie=None, view="L").files()][-2:] == ["B2.png", "b10.png"]
+
+
+@pytest.mark.parametrize(
+    ("name", "double"),
+    [("{}.png", "01.png"), ("{}.png", "1 (1).png"), ("{}.png", "1 - Copy.png"), ("{}.png", "1.jpg"), ("c2_{}_L.png", "C2_001_L.png"),
+     ("c2_{}_L.png", "c2_1_L (2).png"), ("{}.png", "1_L.png")],
+)  # fmt: skip
+def test_two_images_of_one_number(tmp_path: Path, name: str, double: str) -> None:
+    """The view was late from the second one on, without a word."""
+    numbered(tmp_path / "L", 0, 1, 2, 3, pattern=name)
+    assert open_sequence(tmp_path, images="L/*", movie=None, view="L").count == 4
+    numbered(tmp_path / "M", 0, 1, 2, 3, pattern=name)
+    write(tmp_path / "M" / double, np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match=f"View M has two images of number [12]: .*{re.escape(double)}.*; remove one") as error:
+        open_sequence(tmp_path, images="M/*", movie=None, view="M")
+    assert name.format(1) in str(error.value)
+
+
+def test_parts_of_a_recording_that_begin_again_have_no_doubles(tmp_path: Path) -> None:
+    for name in ("p1/0.png", "p1/1.png", "p2/0.png", "p2/1.png", "q/A1.png", "q/B1.png", "q/B2.png"):
+        write(tmp_path / name, np.zeros((8, 8), np.uint8))
+    assert open_sequence(tmp_path, images="p*/*.png", movie=None, view="L").count == 4
+    assert open_sequence(tmp_path, images="q/*.png", movie=None, view="L").count == 3
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """joints.csv and motion.csv: round trips, units, and what they refuse."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.motion import BodyMotion
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
+from tricap.core.foundation import bounded
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.tables import read_guessed, read_joints, read_motion, write_joints, write_motion
 
@@ -32,6 +34,15 @@ def _motion() -> BodyMotion:
         status=("fitted", "partial", "bridged", "suspect"),
         sigma0=np.ones(4),
     )
+
+
+def test_a_table_that_may_not_be_read_is_not_to_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(path: Path, largest: int) -> str:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(bounded, "text_of", forbidden)
+    with pytest.raises(InputError, match="Permission denied; change its rights"):
+        read_joints(tmp_path / "joints.csv")
 
 
 def test_motion_comes_back_within_the_digits_written(tmp_path: Path) -> None:

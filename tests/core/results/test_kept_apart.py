@@ -68,6 +68,34 @@ def test_results_go_into_no_footage_whatever_way_leads_there(take: Path, tmp_pat
     assert names(tmp_path) == before
 
 
+def test_results_go_into_no_folder_of_footage_that_is_spread_over_several(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    """Only the folder of the first image was looked at."""
+    for view in "LCR":
+        for n, path in enumerate(sorted((take / view).iterdir())):
+            part = take / ("p2" if n else "p1") / view
+            part.mkdir(parents=True, exist_ok=True)
+            path.rename(part / path.name)
+    text = (take / "take.toml").read_text(encoding="utf-8")
+    for view in "LCR":
+        text = text.replace(f'"{view}/*.png"', f'"p*/{view}/*.png"')
+    (take / "take.toml").write_text(text, encoding="utf-8")
+    before = names(tmp_path)
+    for command in ("run", "measure"):
+        assert "contains the footage" in refused([command, str(take), "--out", str(take / "p2" / "C")], capfd)
+    assert names(tmp_path) == before
+
+
+@LINKS
+@pytest.mark.parametrize("name", ["fields", "cache", "report"])
+def test_footage_where_results_are_replaced(take: Path, tmp_path: Path, capfd: Capture, name: str) -> None:
+    (tmp_path / "films" / name).mkdir(parents=True)
+    (take / "L").rename(tmp_path / "films" / name / "L")
+    (take / "L").symlink_to(tmp_path / "films" / name / "L")
+    before = names(tmp_path)
+    said = refused(["run", str(take), "--out", str(tmp_path / "films")], capfd)
+    assert "is inside" in said and "where a run replaces files; choose another folder" in said and names(tmp_path) == before
+
+
 def test_a_batch_goes_into_none_of_its_takes(take: Path, tmp_path: Path, capfd: Capture) -> None:
     other = shutil.copytree(take, tmp_path / "throw")
     before = names(tmp_path)
@@ -78,7 +106,7 @@ def test_a_batch_goes_into_none_of_its_takes(take: Path, tmp_path: Path, capfd: 
 def test_a_take_where_results_are_replaced(take: Path, tmp_path: Path, capfd: Capture) -> None:
     """OUT may hold the take, as that of the demo does, but not where a run clears away."""
     (tmp_path / "out" / "report").mkdir(parents=True)
-    (tmp_path / "out" / "run.json").write_text("{}")
+    (tmp_path / "out" / "run.json").write_text('{"format": "tricap-run"}')
     inside = tmp_path / "out" / "report" / "take"
     take.rename(inside)
     assert "where a run replaces files" in refused(["run", str(inside), "--out", str(tmp_path / "out")], capfd)
@@ -127,6 +155,35 @@ def test_results_that_are_read_are_not_replaced(take: Path, tmp_path: Path, capf
     before = path.read_bytes()
     said = refused([command[0], str(take), *command[1:], str(path), "--out", str(tmp_path / "out")], capfd)
     assert "is a result, which this command replaces" in said and path.read_bytes() == before
+
+
+def test_the_bar_next_to_a_rig_replaces_no_other_file(tmp_path: Path, capfd: Capture) -> None:
+    """Its name follows from that of the rig: nobody gave it."""
+    (tmp_path / "bar").mkdir()
+    argv = ["calibrate", str(tmp_path / "bar"), "--bar-length", "0.5", "--out", str(tmp_path / "b.toml")]
+    (tmp_path / "b_bar.csv").write_text("point,view,x,y\na,L,60,60\n")
+    assert "b_bar.csv would be overwritten, and is not of an earlier call" in refused(argv, capfd)
+    assert "b_bar.csv is also an input" in refused([*argv, "--points", str(tmp_path / "b_bar.csv")], capfd)
+    (tmp_path / "b_bar.csv").write_text("frame,1 from L x\n")
+    assert "it needs a folder of images" in refused(argv, capfd)
+
+
+@pytest.mark.parametrize("name", ["points3d.csv", "points2d.csv", "contours/C.csv"])
+def test_tables_of_somebody_else_are_not_replaced(take: Path, tmp_path: Path, capfd: Capture, name: str) -> None:
+    (tmp_path / "points.csv").write_text("point,view,x,y\na,L,60,60\na,C,60,60\n")
+    (tmp_path / "polygon.csv").write_text("x,y\n20,20\n60,20\n60,60\n")
+    out = tmp_path / "out"
+    if "contours" in name:
+        argv = ["contour", str(take), "--view", "C", "--polygon", str(tmp_path / "polygon.csv"), "--set", "fitting.use_surface=false"]
+    else:
+        argv = ["track", str(take), "--points", str(tmp_path / "points.csv")]
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("mine")
+    assert f"{Path(name).name} would be overwritten, and is not of an earlier call" in refused([*argv, "--out", str(out)], capfd)
+    assert (out / name).read_text() == "mine"
+    (out / name).unlink()
+    for _ in range(2):
+        assert main.main([*argv, "--out", str(out), "--frames", "0:1", "--quiet"]) == 0
 
 
 def test_pictures_replace_no_result(tmp_path: Path) -> None:

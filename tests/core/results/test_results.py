@@ -66,6 +66,29 @@ def test_what_was_there_and_is_not_ours(tmp_path: Path) -> None:
     Results(tmp_path / "stopped early")
 
 
+@pytest.mark.parametrize("beside", ["", "cache/", "cache/x/", "cache/x/data.npz", ".tricap-lock", "run.json", "cache/x/numbers.npz"])
+def test_nothing_of_somebody_else_counts_as_the_mark_of_a_run(tmp_path: Path, beside: str) -> None:
+    """A folder “report” of the user was removed, because an empty cache, an empty lock or another program's run.json lay beside it."""
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "thesis.txt").write_text("x")
+    path = tmp_path / (beside or "notes.txt")
+    if beside.endswith("/"):
+        path.mkdir(parents=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('{"loss": 0.5}' if beside == "run.json" else "")
+    if beside.endswith("numbers.npz"):
+        np.savez(path, x=np.zeros(3))
+    with pytest.raises(InputError, match="which was not written by Tricap; choose an empty or a new folder") as error:
+        Results(tmp_path)
+    assert "--restart" not in str(error.value)
+
+
+def test_a_stopped_run_without_a_checkpoint_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "cache" / "starts").mkdir(parents=True)
+    Results(tmp_path)
+
+
 def test_folders_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is a file; choose a folder"):

@@ -113,6 +113,10 @@ def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)  # no Blender
     told = run_take(str(takes[0]), str(tmp_path / "out"), COARSE, False)
     assert told["status"] == Status.DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
+    report = (tmp_path / "out" / "report" / "report.html").stat().st_mtime_ns
+    again = run_take(str(takes[0]), str(tmp_path / "out"), COARSE, False)
+    assert again["status"] == Status.DONE and again["said"] == told["said"]
+    assert (tmp_path / "out" / "report" / "report.html").stat().st_mtime_ns == report, "a finished take is not reported again"
     (tmp_path / "file").write_text("")
     assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == Status.INVALID_INPUT
 

@@ -4,7 +4,9 @@ One sentence and exit code 2 each, nothing that was finished is lost, and the sa
 """
 
 import errno
+import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -185,4 +187,5 @@ def test_what_a_killed_run_left_half_written_is_cleared_away(take: Path, tmp_pat
     for name in (".run.json.x.part", "cache/surface/.0001.npz.y.part", "clouds/.0002.ply.z.part", ".body.77.part.blend"):
         (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_bytes(b"half")
+    (tmp_path / "out" / ".tricap-lock").write_text(json.dumps({"pid": 1, "host": platform.node(), "count": "0"}))
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole

@@ -12,8 +12,10 @@ import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation import store
+from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
+from tricap.core.run.check import check_run
 from tricap.core.run.file_digests import FileDigests
 from tricap.core.run.stages import (
     CONTENT,
@@ -231,6 +233,47 @@ def test_a_run_of_a_copy_computes_nothing_and_of_another_image_everything(
     other_picture(next(iter(sorted((copy / "L").glob("*1.png")))))
     assert main.main(argv) == 0 and "Nothing has changed" not in capfd.readouterr().out
     assert (out / "clouds" / "0001.ply").read_bytes() != cloud
+
+
+def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_they_are_measured(plane_take: Path, tmp_path: Path) -> None:
+    """The stages after the measured one counted as done, beside clouds of other images."""
+    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
+    given, path = {"growing": {"spacing_px": 16}}, take / "L" / "0001.png"
+    os.utime(path, (1000, 1000))
+    pipeline.run(take, out, given, frames=(0, 2))
+    with take_run.open_run(take, out, given, (0, 2)) as again:
+        pipeline.measure(again, Monitor())
+        assert {*STAGES, "report"} == set(again.record["stages"]) and not again.notes
+    other_picture(path)
+    os.utime(path, (1000, 1000.5))
+    with take_run.open_run(take, out, given, (0, 2)) as job:
+        assert {*STAGES, "report"} == set(job.record["stages"])
+        pipeline.measure(job, Monitor())
+        assert set(job.results.read_run()["stages"]) == {"measure"} and job.notes == [take_run.OTHER_IMAGES]
+    assert not (out / "trajectories.npz").exists() and not (out / "report").exists() and not (out / "cache" / "body").exists()
+
+
+def test_footage_that_is_replaced_or_removed_is_named_by_the_run_and_by_the_check(plane_take: Path, tmp_path: Path) -> None:
+    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
+    path = take / "L" / "0001.png"
+
+    def stale() -> list[str]:
+        return [finding.sentence for finding in check_run(out, Monitor()).findings if finding.cause == "stale result"]
+
+    with take_run.open_run(take, out, {"growing": {"spacing_px": 16}}, (0, 2)) as job:
+        for stage in (pipeline.measure, pipeline.track, pipeline.fit):
+            stage(job, Monitor())
+        job.warn_if_replaced()
+        assert take_run.REPLACED not in job.record["warnings"]
+        assert stale() == []
+        other_picture(path)
+        pipeline.report(job, Monitor())
+        assert take_run.REPLACED in job.record["warnings"]
+    assert len(stale()) == 1 and stale()[0].startswith(f"Images, masks or time stamps of {take} were replaced since this run")
+    path.unlink()
+    assert len(stale()) == 1 and "cannot be read as it was for this run" in stale()[0]
+    shutil.rmtree(take)
+    assert stale() == []
 
 
 def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:

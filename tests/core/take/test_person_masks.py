@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core.checking.take_check import check_take
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.results.folder import Results
@@ -46,6 +47,12 @@ def take(tmp_path_factory: pytest.TempPathFactory, scenes: Any, wall: Any, bodie
         for i, body in enumerate(bodies):
             write(folder / f"M{camera.name}" / f"{i}.png", 255.0 * (scenes.render(camera, [body], background=-1e6) > -1e5))
     return Path(folder)
+
+
+@pytest.mark.parametrize("line", ['masks = "L/*.png"', 'mask = "L/0000.png"'])
+def test_the_footage_is_no_mask(take: Path, tmp_path: Path, line: str) -> None:
+    checked = check_take(with_source(take, tmp_path / "take", {"L": line}), Monitor())
+    assert [f for f in checked.findings if "L/0000.png is an image of view L, and no mask; correct `mask`" in f.sentence], checked.lines()
 
 
 def with_source(take: Path, folder: Path, said: dict[str, str]) -> Path:

@@ -185,6 +185,10 @@ FAULTS = {
     "keyframes a table": (text(more="[keyframes]\nframe = 3\n"), "must be written as \\[\\[keyframes\\]\\] tables"),
     "two keyframes alike": (text(more=KEYFRAME + KEYFRAME), "Two \\[\\[keyframes\\]\\] of .* are for the same frame"),
     "surface in a keyframe": (text(more="[[keyframes]]\nframe = 3\nsurface = []\n"), "unknown key “surface”"),
+    "a keyframe for the frame of the seeds": (
+        text(more=KEYFRAME + '[seeds]\nframe = 3\n[seeds.joints]\n"wrist.R" = { L = [5, 5] }\n'),
+        r"A \[\[keyframes\]\] of .* is for frame 3, as \[seeds.joints\] is; write its joints there",
+    ),
     "keyframe of an unknown joint": (text(more=KEYFRAME.replace("elbow.R", "elbow.r")), "Did you mean “elbow.R”?"),
     "corrections a table": (text(more="[corrections]\nframe = 3\n"), "must be written as \\[\\[corrections\\]\\] tables"),
     "movie of a number": (text(views=VIEWS + "movie = 5\n"), "needs either `images`"),

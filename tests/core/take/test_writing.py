@@ -9,7 +9,7 @@ import pytest
 from tricap.core.foundation.errors import InputError
 from tricap.core.take.footage_files import copy_take
 from tricap.core.take.take import read_take
-from tricap.core.take.writing import link_footage, new_table, read_table, renumbered, take_of_table, toml_text, write_table
+from tricap.core.take.writing import has_comments, link_footage, new_table, read_table, renumbered, take_of_table, toml_text, write_table
 
 FULL = {
     "format": "tricap-take", "version": 1, "fps": 29.97, "interlaced": "odd", "rig": "rig.toml", "reference_view": "C", "frames": [2, 40],
@@ -57,6 +57,30 @@ def test_no_file_is_an_empty_table_and_a_broken_one_is_told(tmp_path: Path) -> N
         read_table(tmp_path)
 
 
+def test_a_file_with_comments_is_copied_before_it_is_written(tmp_path: Path) -> None:
+    """They were dropped without a word."""
+    path, table = tmp_path / "take.toml", new_table([{"name": n, "movie": f"{n}#1.mp4"} for n in "LC"])
+    write_table(tmp_path, table)
+    assert not has_comments(tmp_path), "a # in a text is none"
+    for number, name in ((1, "take.toml.bak"), (2, "take.toml.2.bak")):
+        commented = path.read_text() + f"# thought {number}\n"
+        path.write_text(commented)
+        assert has_comments(tmp_path) and write_table(tmp_path, table | {"fps": 30.0 + number})
+        assert (tmp_path / name).read_text() == commented and not has_comments(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_link_is_not_replaced_by_a_take(tmp_path: Path) -> None:
+    (tmp_path / "take").mkdir()
+    table = new_table([{"name": n, "movie": f"{n}.mp4"} for n in "LC"])
+    (tmp_path / "shared.toml").write_text(toml_text(table))
+    (tmp_path / "take" / "take.toml").symlink_to(tmp_path / "shared.toml")
+    assert not write_table(tmp_path / "take", table), "nothing changes"
+    with pytest.raises(InputError, match="is a link, which a file would replace"):
+        write_table(tmp_path / "take", table | {"fps": 30.0})
+    assert (tmp_path / "take" / "take.toml").is_symlink()
+
+
 def test_a_new_table_is_a_take(tmp_path: Path) -> None:
     take = take_of_table(tmp_path, new_table([{"name": n, "movie": f"{n}.mp4"} for n in "LCR"], fps=50.0, model="arm.R"))
     assert (take.fps, take.reference_view, take.body_model) == (50.0, "C", "arm.R")
@@ -72,6 +96,8 @@ def test_frames_are_renumbered_when_an_image_becomes_two() -> None:
     assert renumbered(double, 1, 2) == table and renumbered({"fps": 25.0}, 2, 1) == {"fps": 25.0}
     both = {"keyframes": [{"frame": 4, "joints": {"a": 1}}, {"frame": 5, "joints": {"a": 2}}], "frames": [3, 9]}
     assert renumbered(both, 1, 2) == {"keyframes": [{"frame": 2, "joints": {"a": 1}}], "frames": [1, 5]}
+    met = {"seeds": {"frame": 4, "joints": {"a": 1}}, "keyframes": [{"frame": 5, "joints": {"a": 2, "b": 3}}]}
+    assert renumbered(met, 1, 2) == {"seeds": {"frame": 2, "joints": {"a": 1, "b": 3}}, "keyframes": []}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
