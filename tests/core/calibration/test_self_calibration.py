@@ -79,7 +79,7 @@ def test_cameras_need_no_position_in_common(seen_by: str) -> None:
 
 
 @pytest.mark.slow
-def test_random_rigs_converge() -> None:
+def test_many_random_rigs_converge() -> None:
     far = []
     for seed in range(120):
         sigma = float(np.random.default_rng(seed).uniform(0.05, 0.3))
