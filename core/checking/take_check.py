@@ -68,8 +68,8 @@ def joint_findings(take: Take) -> list[Finding]:
         )
         return [*foreign, doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
-    few = {*joints} <= {name for names in LIMBS.values() for name in (*names, "toe.R", "toe.L")}
-    missing = [name for limb, names in LIMBS.items() if few and {*names} <= {*joints} for name in names if name not in clicked]
+    only_limbs = {*joints} <= {"toe.R", "toe.L"}.union(*LIMBS.values())  # the body is no person
+    missing = [name for names in LIMBS.values() if only_limbs and {*names} <= {*joints} for name in names if name not in clicked]
     if not bare and missing:
         sentence = f"Not clicked in two views: {', '.join(missing)}. The fit has to find where the limb ends or bends."
         return [*foreign, remark(Cause.FEW_CLICKS, sentence, advice)]

@@ -22,7 +22,7 @@ from ..geometry.rig import read_rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
 from ..results.listed_files import check_files
 from ..results.outputs import check_output, check_replaceable
-from ..take.bar_file import FIRST, bar_path, write_bar
+from ..take.bar_file import STARTS, bar_path, write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
 
@@ -116,7 +116,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
     if not args.format and (board is None or args.with_board is not None):
         check_output(bar_path(args.out), [path for path in (args.points, args.like) if path is not None])
-        check_replaceable(bar_path(args.out), *FIRST)
+        check_replaceable(bar_path(args.out), *STARTS)
     if args.report:
         check_report(args.report)
     if args.format:

@@ -40,11 +40,8 @@ SEEN = 4.0  # of a cell with measured points
 COUPLING, RADIUS, ROUNDS = 6.0, 2.0, 10  # w of (2), sigma of G in cells, iterations
 SMALLEST = 60  # cells of a region
 NORMAL_QUARTILE, NORMAL_UPPER = 0.3186, 1.1503  # lower and upper quartile of |N(0, 1)|
-GAIN_CELLS, GAIN_STEPS, GAIN_PRIOR = (
-    4000,
-    10,
-    1e4,
-)  # of a gain: cells, iterations with each weight, weight of 0 (grey values² over the noise's)
+GAIN_CELLS, GAIN_STEPS = 4000, 10  # for a gain: cells, and iterations with each weight
+GAIN_PRIOR = 1e4  # weight of no gain, in grey values² over the noise's
 GAIN_WIDTH = 3.0  # times the noise, of the second weight
 LEAST_GAIN = 0.25  # times the noise, of what a gain changes (root mean square): the person adds up to 0.15
 OTHER_LIGHT = 4.0  # times the noise: the difference of so large a share is not noise

@@ -68,7 +68,7 @@ from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .settings import Overrides
 from .stages import CONTENT, STAGES
-from .take_run import SURFACE, Run, open_run
+from .take_run import FIT_STEPS, SURFACE, Run, open_run
 from .workers import measure_at_once
 
 BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin", "outlines")  # of the fit, besides the report
@@ -325,7 +325,7 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     else:
         given, body, tracked_again = _fit_to(run, given, background, monitor)
     run.body = body = _write_body(run, body, monitor)
-    run.results.remove("cache/fit", "cache/fit_again")
+    run.results.remove(*FIT_STEPS)
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     skin_at = skin_in(run.results.path("skin"), body, run.settings["skin"])
     run.silhouettes = silhouettes_of(run.footage, body, skin_at, outlines, background, monitor)

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_k
 SURFACE = "surface"  # of the measured stage in run.json: the digest of the keys of its frames, with the content of their images
 OTHER_IMAGES = "The images are not those that were measured before; tracks and body of these were removed."
 REPLACED = "Images or other files of the take were replaced or removed during this run, so its results do not fit each other. Run it again."
-CACHED_FITS = ("cache/fit", "cache/fit_again", "cache/body")
+FIT_STEPS = ("cache/fit", "cache/fit_again")  # checkpoints of a fit under way
+FITTED = "cache/body"
 
 
 @dataclass(kw_only=True)
@@ -109,7 +111,7 @@ class Run:
         after = STAGES[STAGES.index("measure") + 1 :]
         self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in (*after, "report")}
         names = [name for stage in after for name in STAGE_INPUTS[stage].files]
-        self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *CACHED_FITS])]
+        self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *FIT_STEPS, FITTED])]
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
@@ -164,24 +166,10 @@ def open_run(
     take = read_take(take_folder)
     take = take if clicked is None else clicked(take)
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
-    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
-    if frames is not None:
-        footage = only_frames(footage, frames)
-    for name, at in take.clicks.joints.items():
-        clicked_depth(footage, name, at)
-    if take.joints_model is not None:
-        read_model(take.joints_model)
-    check_separate_folder(out, take.folder, (path for s in footage.sequences for path in s.files()))
+    footage = _checked_footage(take, settings, out, frames)
     check_pictured(footage.frames, pictures)
     keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
     begun, opened = dict(settings), keys["measure"]
-
-    def replaced() -> bool:
-        try:
-            return stage_keys(footage, begun, Path(out))["measure"] != opened
-        except InputError:
-            return True
-
     with Results(out).opened() as results:
         notes = _remove_all(results) if restart else []
         before, digests = {} if restart else results.read_run(), FileDigests()
@@ -197,12 +185,33 @@ def open_run(
         if before:  # what was made otherwise must not stand beside the new
             notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
         run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
-        run.replaced = replaced
+        run.replaced = partial(_are_others, footage, begun, Path(out), opened)
         run.notes, run.digests = notes, digests
         with _with_errors(run.notes):
             if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
                 run.content_keys = by_content()
             yield run
+
+
+def _checked_footage(take: Take, settings: Mapping[str, Any], out: Path, frames: tuple[int, int] | None) -> Footage:
+    """The footage of a take, or only some frames of it, with what can be checked before a run."""
+    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
+    if frames is not None:
+        footage = only_frames(footage, frames)
+    for name, at in take.clicks.joints.items():
+        clicked_depth(footage, name, at)
+    if take.joints_model is not None:
+        read_model(take.joints_model)
+    check_separate_folder(out, take.folder, (path for s in footage.sequences for path in s.files()))
+    return footage
+
+
+def _are_others(footage: Footage, settings: Mapping[str, Any], out: Path, key: str) -> bool:
+    """Whether the files that the surface is measured from are no longer those of this key."""
+    try:
+        return stage_keys(footage, settings, out)["measure"] != key
+    except InputError:
+        return True
 
 
 def _known(results: Results, run: dict[str, Any], keys: dict[str, str], by_content: Callable[[], dict[str, str]]) -> dict[str, str]:

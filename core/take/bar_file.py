@@ -20,7 +20,7 @@ from ..motion.formats.markers import read_points_csv
 AGREE_M = 1e-3  # between the positions from all cameras of the right rig, which differ by rounding only
 
 
-FIRST = ("frame,1 from ", 'frame,"1 from ')  # how the file begins
+STARTS = ("frame,1 from ", 'frame,"1 from ')  # how the file begins
 
 
 def bar_path(rig_path: Path) -> Path:

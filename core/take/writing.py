@@ -24,7 +24,7 @@ Table = dict[str, Any]
 DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # that a file may leave out
 STRING = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'')
 MOST_COPIES = 99
-COPIED = " The file with your comments was copied to take.toml.bak."
+COPIED = " The file with your comments was copied beside it (*.bak)."
 ASSUMED_FPS = 25.0  # of footage that states no frame rate, where nobody says it either
 
 
