@@ -13,6 +13,7 @@ from .explained import Evidence, explained_area
 from .inputs.background import BackgroundRegions
 from .inputs.clicks import Clicks
 from .inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints
+from .inputs.image_tracks import ImageTracks
 from .inputs.keypoints import JointTracks
 from .inputs.silhouettes import Silhouettes
 from .observations import (
@@ -66,11 +67,13 @@ class FitContext:
     collisions: CollisionPairs
     found: tuple[str, ...] = ()  # joints that were found without clicks where the fit begins: bones between them have their own lengths
     unsure: tuple[str, ...] = ()  # of these, joints of limbs that are not certain
+    in_views: ImageTracks | None = None  # points followed in single views, where none are measured in space
     monitor: Monitor = field(default_factory=Monitor)  # checked for cancellation within the steps
 
     def stretch(self, frames: Sequence[int]) -> "FitContext":
         """The same for some of the frames, whose indices then begin at 0; only `click` stays the index in the recording."""
-        parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "background")}
+        names = ("tracks", "silhouettes", "background", *(() if self.in_views is None else ("in_views",)))
+        parts = {name: getattr(self, name).stretch(frames) for name in names}
         clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
         return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, **parts)
 
@@ -125,11 +128,14 @@ class FitContext:
         return [self.surface(points, state, gate_scale, cache), *self.silhouettes.observe(t, state, cache, gate_scale)]
 
     def evidence(self, t: int, points: CloudPoints, state: BodyState) -> np.ndarray:
-        """The points of each bone (B,), rays of outlines counted as points; a keypoint at its end counts as enough."""
+        """The points of each bone (B,), rays of outlines and points followed in single views counted as several; a keypoint at its end
+        counts as enough."""
         b, ends = len(state.lengths_m), [self.model.skeleton.joint_names.index(bone.tail_joint) for bone in self.model.skeleton.bones]
         counts = np.bincount(segment(points, state, self.model.surface, self.settings.gate_m)[1], minlength=b)
         for rays in self.silhouettes.observe(t, state):
             counts += POINTS_OF_RAY * np.bincount(rays.bone, minlength=b)
+        if self.in_views is not None:
+            counts += POINTS_OF_RAY * self.in_views.counts(t, state)
         return np.asarray(counts + np.where(np.isin(ends, self.tracks.joints(t)), self.settings.min_points, 0))
 
     @property

@@ -29,6 +29,7 @@ FACING = 0.6  # least cosine between a point's normal and the limb's
 WIDEST_M, NARROWEST_M = 0.030, 0.003  # of σ in (3)
 ROUNDS = 6  # of (2) and (3)
 OUTLIERS = (0.05, 0.5)  # π_0 at the start, and at most
+ALONG, AROUND = 9, 10  # points on the surface of a limb
 LEAST_SHARE = 0.05  # of a point for a limb; a smaller one is not worth its equation
 
 
@@ -137,6 +138,21 @@ def bone_distance(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone
 def gap_to_bone(xyz_m: np.ndarray, state: BodyState, bone: np.ndarray) -> np.ndarray:
     """Distance (N,) [m] of points from the surface of one limb each (N,)."""
     return _gap(xyz_m, state, bone)[0]
+
+
+def surface_points(state: BodyState) -> np.ndarray:
+    """Points (P, 3) evenly all over the surface of all limbs."""
+    bones = np.unique(state.balls.bone_index)
+    along, angle = (
+        grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, ALONG), np.linspace(0, 2 * np.pi, AROUND, endpoint=False), indexing="ij")
+    )
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = []
+    for b in bones.tolist():
+        across = circle * state.profile_table.across(np.full(len(along), b), along, circle)
+        local = np.stack([across[:, 0], along * state.lengths_m[b], across[:, 1]], axis=1)
+        found.append(state.head_m[b] + local @ state.R[b].T)
+    return np.concatenate(found)
 
 
 def _gap(xyz_m: np.ndarray, state: BodyState, bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,10 +21,12 @@ from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, read_skin
 from ..body.skin.posed import Poser
 from ..fitting.inputs.completed_clouds import clouds_for_fit
-from ..fitting.inputs.no_surface import background_regions, empty_clouds
+from ..fitting.inputs.no_surface import background_regions, empty_clouds, points_in_views
 from ..fitting.inputs.take_inputs import check_body, fit_input
 from ..fitting.stages.fit_again import EarlierFit, around, fit_again, with_held
+from ..fitting.stages.rough_motion import bodies_in
 from ..fitting.stages.set_up import of_model
+from ..fitting.state import ShapeParameters
 from ..foundation import store
 from ..foundation.arrays import LazySequence
 from ..foundation.errors import InputError
@@ -42,7 +44,7 @@ from ..tracking.trajectories import read_trajectories
 from .file_digests import FileDigests
 from .record import FrameTable, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
-from .stages import CONTENT, Stamp, stage_keys, time_stamp
+from .stages import CONTENT, Stamp, stage_keys
 
 FITTED_WITH = "fitted_with"  # entry of the fit in run.json: what the body was fitted with, see `fitted_with`
 MOST_CLOUDS = 64  # in memory: those of the background, and of one stretch
@@ -73,12 +75,12 @@ def fitted_with(footage: Footage, settings: Mapping[str, Any], out: Path) -> dic
         s.frame: {name: store.digest(repr(FrameClicks(joints={name: at}).table())) for name, at in s.joints.items()}
         for s in _clicked(footage)
     }
-    besides = besides_clicks(footage, settings, out, time_stamp)
+    besides = besides_clicks(footage, settings, out)
     return {"besides": besides, "clicks": {str(frame): digests for frame, digests in sorted(clicks.items())}}
 
 
-def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp) -> str:
-    """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file."""
+def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp | None = None) -> str:
+    """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file, by default its time."""
     take = replace(footage.take, clicks=replace(footage.take.clicks, joints={}), keyframes=())
     return stage_keys(replace(footage, take=take), settings, out, stamp)["fit"]
 
@@ -243,10 +245,14 @@ def _fitted(
 
         clouds = LazySequence(footage.frames, cloud_of)
     trajectories = read_trajectories(results.folder) if fitting.use_surface else None
-    background = background_regions(footage, results, clouds, fitting, monitor, wider)
+    parameters = ShapeParameters(body.shape, fitting.weights)
+    bodies = None if trajectories is not None else bodies_in(parameters, body.earlier.values, parameters.vector())
+    background = background_regions(footage, results, clouds, fitting, monitor, wider, bodies)
     part = replace(footage, frames=footage.frames[wider.start : wider.stop])
     chosen = clouds_for_fit(part, [clouds[row] for row in wider], trajectories, background, fitting, results, monitor)
     given = of_model(fit_input(part, chosen, trajectories, results, background), body.model)
+    if bodies is not None and fitting.use_trajectories:
+        given = replace(given, image_tracks=points_in_views(part, background, monitor, bodies[wider.start : wider.stop]))
     return fit_again(given, body.earlier, rows, joints, fitting, monitor)
 
 

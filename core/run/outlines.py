@@ -23,6 +23,7 @@ from ..tracking.contour import (
     relax_contour,
     resampled,
 )
+from . import drawn_outlines
 from .inspection import body_outline
 from .take_run import Run
 
@@ -88,11 +89,14 @@ def write_contour(job: Run, name: str, monitor: Monitor, start: Start, folder: s
     view = [v.name for v in job.footage.take.views].index(name)
     path, on_edge = job.results.path(folder, f"{name}.csv"), list[float]()
     checkpoints = ContourCheckpoints(job, view, start) if start.outlines is None else None
+    images = drawn_outlines.drawn_on(job.footage, name, job.digests)
     with store.written(path) as file:
         file.write(HEAD.encode())
         for frame, contour in track_contour(job, view, monitor, start, checkpoints):
             file.write(contour_rows(frame, contour).encode())
             on_edge.append(contour.on_edge.mean())
+    if folder == drawn_outlines.FOLDER:
+        job.record.setdefault(drawn_outlines.ENTRY, {})[name] = drawn_outlines.entry_of(job.results.folder, name, images)
     job.results.remove(f"cache/{_checkpoints(view)}")
     job.results.write_run(job.record)
     return f"{path}: the outline in {len(on_edge)} frames, {100 * float(np.mean(on_edge)):.0f} % of its vertices on an edge."

@@ -93,7 +93,7 @@ class WholeSurface:
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """q (N, 3 m), the coordinates of points in the balls' axes over their radii, ball after ball, and the balls' fields (N, m)."""
         q = points @ self._axes - self._shift
-        each = q.reshape(len(points), -1, 3)
+        each = q.reshape(len(points), self._shape.metaballs.weight.size, 3)
         return q, self._shape.metaballs.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", each, each))
 
     def _joined(self, points: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

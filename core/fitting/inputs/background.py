@@ -35,7 +35,7 @@ from ..observations import BackgroundExclusion
 from ..observations.background import DistanceMap
 from ..settings import FitSettings
 from ..state import ShapeParameters, free_bones
-from .fit_input import BackgroundDistances, FitInput, Packed
+from .fit_input import UNKNOWN, BackgroundDistances, FitInput, Packed
 
 FRACTIONS = (0.2, 0.5, 0.8, 1.0)  # of a bone's axis, where its places are
 SAMPLES = 21  # frames for a view's background
@@ -45,6 +45,7 @@ MOST_CELLS = 600  # of a view, for a search
 HALF = 0.5  # of a cell is the person's, if the cell is
 STILL = 0.25  # of a limb's line looks like the background, if the limb stands still
 NEAR_M = 0.025  # nothing so near to a measured point shows the background
+ROUGHLY_M = 0.06  # … and to a body whose place is known about
 BAND = 0.5  # width of a clicked limb over the mean length of the limbs
 CACHED_BYTES = 64_000_000  # of the frames whose distances are unpacked
 
@@ -132,10 +133,14 @@ def _person_cells(view: DistanceMap) -> PersonCells:
 
 
 def find_background(
-    footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor, rows: Sequence[int] | None = None
+    footage: Footage,
+    clouds: Sequence[PointCloud],
+    monitor: Monitor,
+    rows: Sequence[int] | None = None,
+    bodies: Sequence[np.ndarray] | None = None,
 ) -> list[BackgroundDistances]:
     """Where the views show the person and where the background, in the frames of the clouds, or of those in `rows`; of the views in which
-    that is known.
+    that is known. `bodies`: points (P, 3) on the person's surface in each frame, about, where nothing was measured.
 
     Raises:
         InputError: an image or a mask cannot be read, or the background in take.toml is not that of the view.
@@ -144,7 +149,7 @@ def find_background(
     frames = np.array([cloud.frame for cloud in clouds])
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
     sizes = _cell_sizes(footage, clouds, chosen)
-    known = {k: b for k, b in enumerate(_backgrounds(footage, clouds, chosen, sizes, monitor)) if b is not None}
+    known = {k: b for k, b in enumerate(_backgrounds(footage, clouds, chosen, sizes, monitor, bodies)) if b is not None}
     masked = {k for k in range(len(sizes)) if _has_silhouettes(footage, k)}
     if not known and not masked:
         return []
@@ -156,7 +161,7 @@ def find_background(
         camera, size = footage.rig.cameras[k], sizes[k]
         if k in known:
             image = cells(images[k], size)
-            seen = _near(camera, cloud.xyz_m, image.shape, size, CELL_M)
+            seen = near_points(camera, cloud.xyz_m, image.shape, size, CELL_M)
             shown = person(known[k], image, seen)
             shown = np.ones(image.shape, dtype=bool) if shown is None else (shown | seen | persons[k]) & limits.get(k, True)
         else:
@@ -165,7 +170,7 @@ def find_background(
         beyond = (~(shown | unknown)).astype(np.uint8)
         far = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
         steps = np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)
-        return np.where(unknown, 1, steps).astype(np.uint8)  # next to the person: neither that nor background
+        return np.where(unknown, UNKNOWN, steps).astype(np.uint8)
 
     wanted = range(len(clouds)) if rows is None else rows
     for i, t in enumerate(wanted):
@@ -175,7 +180,17 @@ def find_background(
         for k, of_view in zip(found, in_threads(partial(distances, cloud, images), [*found])):
             found[k].append(of_view)
     views, frames = footage.take.views, frames[list(wanted)]
-    return [BackgroundDistances(view=views[k].name, frame=frames, distance=d, step_px=sizes[k], unit_px=UNIT_PX) for k, d in found.items()]
+    return [
+        BackgroundDistances(
+            view=views[k].name,
+            frame=frames,
+            distance=d,
+            step_px=sizes[k],
+            unit_px=UNIT_PX,
+            estimated=k in known and views[k].background is None,
+        )
+        for k, d in found.items()
+    ]
 
 
 def _has_silhouettes(footage: Footage, k: int) -> bool:
@@ -206,7 +221,12 @@ def _cell_sizes(footage: Footage, clouds: Sequence[PointCloud], chosen: Sequence
 
 
 def _backgrounds(
-    footage: Footage, clouds: Sequence[PointCloud], chosen: Sequence[int], sizes: Sequence[int], monitor: Monitor
+    footage: Footage,
+    clouds: Sequence[PointCloud],
+    chosen: Sequence[int],
+    sizes: Sequence[int],
+    monitor: Monitor,
+    bodies: Sequence[np.ndarray] | None = None,
 ) -> list[CellBackground | None]:
     """The background of every view: the user's image of it, or what stays the same in the chosen frames; None where they are too few."""
     points, numbers = [clouds[t].xyz_m for t in chosen], [clouds[t].frame for t in chosen]
@@ -223,10 +243,14 @@ def _backgrounds(
         if view.background is not None:
             return _given_background(footage, k, images, size)
         everywhere = any(map(len, points))  # a frame without points does not show where the person is
-        near = [
-            _near(camera, xyz_m, images[0].shape, size, NEAR_M) if len(xyz_m) else np.full(images[0].shape, everywhere) for xyz_m in points
-        ]
-        seen = [_near(camera, xyz_m, images[0].shape, size, CELL_M) for xyz_m in points]
+        if bodies is not None:
+            near = [near_points(camera, bodies[t], images[0].shape, size, ROUGHLY_M) for t in chosen]
+        else:
+            near = [
+                near_points(camera, xyz_m, images[0].shape, size, NEAR_M) if len(xyz_m) else np.full(images[0].shape, everywhere)
+                for xyz_m in points
+            ]
+        seen = [near_points(camera, xyz_m, images[0].shape, size, CELL_M) for xyz_m in points]
         return still_background(images, near, seen, size)
 
     monitor.step("background", 0, len(clouds))
@@ -250,7 +274,7 @@ def _given_background(footage: Footage, k: int, images: Sequence[np.ndarray], si
     return background
 
 
-def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...], size: int, reach_m: float) -> np.ndarray:
+def near_points(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...], size: int, reach_m: float) -> np.ndarray:
     """Cells (h, w) of `size` pixels within reach of the images of points (N, 3), the next ones at least."""
     hit = np.zeros(shape, np.uint8)
     if not len(xyz_m):
@@ -277,7 +301,7 @@ def _clicked_limbs(
             points = clouds[frames.index(clicked.frame)].xyz_m if clicked.frame in frames else np.zeros((0, 3))
             for k, background in backgrounds.items():
                 size = background.cell_px
-                seen = _near(footage.rig.cameras[k], points, background.grey.shape, size, CELL_M)
+                seen = near_points(footage.rig.cameras[k], points, background.grey.shape, size, CELL_M)
                 shown = person(background, cells(images[k], size), seen)
                 if shown is not None:
                     _add_still(masks[k], _lines(skeleton, clicked, footage.rig, take.views[k].name, size), ~(shown | seen))

@@ -11,10 +11,12 @@ import numpy as np
 from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
 from ...geometry.rig import Rig
+from ...tracking.image_points import ImageStep
 from .cloud_points import Cloud
 from .material_tracks import Trajectories
 from .start_joints import StartJoints
 
+UNKNOWN = 1  # of stored distances from the person: whether the cell shows the background; the cells next to the person have more
 IN_MEMORY = 1 << 24  # bytes of packed images; more go to a temporary file
 ClickedAt = Mapping[str, Mapping[str, Sequence[float]]]  # joint -> view -> (x, y) full-frame pixels
 
@@ -115,7 +117,7 @@ class Packed(Sequence[np.ndarray]):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BackgroundDistances:
-    """The distance of every place of a view from the person: 0 inside the person's outline.
+    """The distance of every place of a view from the person: 0 inside the person's outline, `UNKNOWN` where that is not known.
 
     Node (j, i) is the middle of a cell of `step_px` × `step_px` pixels. Distances are stored in steps of `unit_px`.
     """
@@ -125,6 +127,7 @@ class BackgroundDistances:
     distance: Packed  # T of (h, w)
     step_px: int
     unit_px: float
+    estimated: bool = False  # from what stays the same in the images; not from masks, drawn outlines or an image of the background
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", frozen(self.frame, (len(self.distance),), np.int64, "frame"))
@@ -146,6 +149,7 @@ class FitInput:
     clicks: Mapping[int, ClickedAt] = field(default_factory=dict)
     click_frame: int | None = None  # where the fit begins; None: where most joints are located
     trajectories: Trajectories | None = None
+    image_tracks: Mapping[str, Sequence[ImageStep]] = field(default_factory=dict)  # without trajectories: T − 1 steps of each view
     contours: Sequence[Outlines] = ()
     keypoints: Sequence[JointPlaces] = ()
     background: Sequence[BackgroundDistances] = ()

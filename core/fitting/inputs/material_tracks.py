@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from copy import copy
 from functools import partial
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
-from ..observations import MaterialSteps
+from ..observations import MaterialSteps, Steps, StepsFromFixed
 from ..segmentation import SegmentationCache, segment
 from ..settings import FitSettings
 from ..state import BodyState
@@ -33,6 +33,22 @@ class Trajectories(Protocol):
         """(T, N)."""
 
 
+class PointTracks(Protocol):
+    """Points that were followed from frame to frame, in the order of the fit's frames."""
+
+    def stretch(self, frames: Sequence[int]) -> Self:
+        """Those of some of the frames; their points are assigned to limbs anew."""
+
+    def steps(self, t: int, a: BodyState, b: BodyState) -> Steps | None:
+        """The observations of the points on the same limb in frame t (body `a`) and t + 1 (body `b`)."""
+
+    def from_fixed(self, t: int, other: BodyState, backwards: bool) -> StepsFromFixed | None:
+        """The same for one body, while the `other` is fixed: that of frame t, or backwards that of frame t + 1."""
+
+    def forget(self) -> None:
+        """Assign points to limbs anew: what follows must not depend on what was computed before."""
+
+
 class MaterialTracks:
     """Tracked points in the order of the fit's frames."""
 
@@ -53,8 +69,17 @@ class MaterialTracks:
         part.forget()
         return part
 
-    def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
-        """The observations of the points on the same limb in frame t (body `a`) and t + 1 (body `b`); None: not yet known."""
+    def steps(self, t: int, a: BodyState, b: BodyState) -> Steps | None:
+        """See `PointTracks`."""
+        return self._steps(t, a, b)
+
+    def from_fixed(self, t: int, other: BodyState, backwards: bool) -> StepsFromFixed | None:
+        """See `PointTracks`."""
+        steps = self._steps(t, None, other) if backwards else self._steps(t, other, None)
+        return None if steps is None else StepsFromFixed(steps=steps, other=other, backwards=backwards)
+
+    def _steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
+        """`steps`; None: a body that is not yet known."""
         rows, sigma = self._pairs[t]
         found = [
             self._cache.get((t, i), state, partial(self._limbs, i, rows, sigma, state))

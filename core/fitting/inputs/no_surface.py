@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,12 +12,15 @@ from ...results.folder import Results
 from ...surface.cloud import PointCloud
 from ...take.footage import Footage
 from ...tracking.contour import ContourTable, Polygons
+from ...tracking.image_points import ImageStep, followed
 from ..settings import FitSettings
-from .background import UNIT_PX, find_background
+from .background import UNIT_PX, find_background, near_points
 from .fit_input import BackgroundDistances, Packed
 
 STEP_PX = 4  # of the distances from outlines
 LEAST_CORNERS = 3  # of a polygon
+ON_BODY_M = 0.03  # of a body whose place is known about, from which points are followed
+AROUND = 0.04  # of the picture's longer side, about what differs from the background: parts that stand still are near those that move
 SUBPIXEL_BITS = 4  # of a polygon's vertices in OpenCV's fixed-point coordinates
 
 
@@ -55,6 +59,44 @@ def outline_polygons(footage: Footage, results: Results, folder: str = "contours
     return {name: found for name, found in polygons.items() if found}
 
 
+def points_in_views(
+    footage: Footage, background: Sequence[BackgroundDistances], monitor: Monitor, bodies: Sequence[np.ndarray] | None = None
+) -> dict[str, list[ImageStep]]:
+    """The points of the person that are followed in each view by itself (`tracking.image_points`), in views whose background is known;
+    nothing of interlaced video. `bodies`: see `find_background`; the points are near them.
+
+    Raises:
+        InputError: an image cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    if footage.take.interlaced != "none":
+        return {}
+    names, found = [view.name for view in footage.take.views], dict[str, list[ImageStep]]()
+    for i, region in enumerate(background):
+        k = names.index(region.view)
+
+        def read(frame: int, k: int = k) -> np.ndarray:
+            return footage.sequences[k].read(footage.number(k, frame))
+
+        person = partial(_person, footage, region, bodies)
+        found[region.view] = list(followed(read, footage.frames, person, monitor.part("follow points", i, len(background))))
+    return found
+
+
+def _person(footage: Footage, region: BackgroundDistances, bodies: Sequence[np.ndarray] | None, frame: int) -> np.ndarray:
+    """Where (h, w) the person is in a view: near the body, if its place is known about, or near what differs from the background."""
+    camera = footage.rig[region.view]
+    shape = camera.size_px[::-1]
+    if bodies is not None:
+        return near_points(camera, bodies[frame - footage.frames.start], shape, 1, ON_BODY_M)
+    distance = region.of_frame(frame)
+    if distance is None:
+        return np.zeros(shape, dtype=bool)
+    reach = 2 * (round(AROUND * max(distance.shape)) if region.estimated else 0) + 1
+    shown = cv2.dilate((distance == 0).astype(np.uint8), np.ones((reach, reach), np.uint8))
+    return np.asarray(cv2.resize(shown, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
+
+
 def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """The mask (h, w) of a polygon (V, 2)."""
     mask = np.zeros(size_px[::-1], np.uint8)
@@ -69,10 +111,11 @@ def background_regions(
     settings: FitSettings,
     monitor: Monitor,
     rows: range | None = None,
+    bodies: Sequence[np.ndarray] | None = None,
 ) -> list[BackgroundDistances]:
     """The background regions of the views: outside the outline; in views without one, where the still background is visible.
 
-    `rows`: of the clouds, in whose frames they are wanted; by default in all.
+    `rows`: of the clouds, in whose frames they are wanted; by default in all. `bodies`: see `find_background`.
 
     Raises:
         InputError: an image or a table of contours cannot be read.
@@ -82,7 +125,7 @@ def background_regions(
         return []
     wanted = footage if rows is None else replace(footage, frames=footage.frames[rows.start : rows.stop])
     outlines = outline_polygons(wanted, results) if settings.use_contours else {}
-    others = find_background(footage, clouds, monitor, rows) if len(outlines) < len(footage.take.views) else []
+    others = find_background(footage, clouds, monitor, rows, bodies) if len(outlines) < len(footage.take.views) else []
     return background_outside_outlines(footage, outlines) + [region for region in others if region.view not in outlines]
 
 

@@ -21,7 +21,7 @@ from ..segmentation import SegmentationCache, facing_bone, owners
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
-from .fit_input import BackgroundDistances, FitInput, Outline, Outlines
+from .fit_input import UNKNOWN, BackgroundDistances, FitInput, Outline, Outlines
 
 SPACING_M, COARSE_SPACING_M = 0.012, 0.03  # of the rays at the body: of a drawn outline, and of one against the background
 BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders and the crown, where the parts' fields meet
@@ -53,6 +53,7 @@ class PersonOutlines:
     """The outlines of the region that covers the still background of a view (`fit_input.Outlines`), made on demand."""
 
     regions: BackgroundDistances
+    beside_unknown: bool = True  # also where it is unknown whether the cells beyond show the background
 
     @property
     def view(self) -> str:
@@ -64,7 +65,10 @@ class PersonOutlines:
         distance = self.regions.of_frame(frame)
         if distance is None or distance.all() or not distance.any():
             return None
-        parts = [_smooth_outline(c[:, 0], distance.shape) for c in _contours(distance == 0) if len(c) >= SMALLEST]
+        unknown = np.zeros(distance.shape, dtype=bool)
+        if not self.beside_unknown:
+            unknown = cv2.dilate((distance == UNKNOWN).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        parts = [_smooth_outline(c[:, 0], unknown) for c in _contours(distance == 0) if len(c) >= SMALLEST]
         if not parts:
             return None
         xy, normal = (np.concatenate(column) for column in zip(*parts))
@@ -110,7 +114,14 @@ class Silhouettes:
         exact, coarse = settings.model_sigma_m, max(settings.model_sigma_m, COARSE_SIGMA_M)
         self._views = [_View(camera=given.rig[d.view], outlines=d, drawn=True, spacing_m=SPACING_M, model_m=exact) for d in drawn]
         self._views += [
-            _View(camera=given.rig[o.view], outlines=PersonOutlines(regions=o), drawn=False, spacing_m=COARSE_SPACING_M, model_m=coarse)
+            _View(
+                camera=given.rig[o.view],
+                # without measured points the body rests on these outlines, and wrong ones would shape it
+                outlines=PersonOutlines(regions=o, beside_unknown=not given.image_tracks),
+                drawn=False,
+                spacing_m=COARSE_SPACING_M,
+                model_m=coarse,
+            )
             for o in (others if settings.use_background else ())
         ]
         self._frames = given.frames
@@ -188,8 +199,9 @@ def _contours(person: np.ndarray) -> list[np.ndarray]:
     return list(cv2.findContours(person.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0])
 
 
-def _smooth_outline(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 2) in cells and unit outward normals (V, 2) of a closed outline of cells (V, 2), without those at the image's border.
+def _smooth_outline(corners: np.ndarray, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 2) in cells and unit outward normals (V, 2) of a closed outline of cells (V, 2), without those at the image's border or
+    in cells beyond which it is `unknown` (h, w) whether they show the background.
 
     OpenCV follows the outside of a region counter-clockwise and a hole clockwise, in an image whose y points down.
     """
@@ -200,8 +212,14 @@ def _smooth_outline(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[np.nda
     along = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     size = np.linalg.norm(normal, axis=1)
-    h, w = shape
-    kept = (size > 0) & (corners >= AT_BORDER).all(axis=1) & (corners[:, 0] < w - AT_BORDER) & (corners[:, 1] < h - AT_BORDER)
+    h, w = unknown.shape
+    kept = (
+        (size > 0)
+        & ~unknown[corners[:, 1], corners[:, 0]]
+        & (corners >= AT_BORDER).all(axis=1)
+        & (corners[:, 0] < w - AT_BORDER)
+        & (corners[:, 1] < h - AT_BORDER)
+    )
     outward = normal[kept] / size[kept, None]
     return xy[kept] + EDGE * outward, outward
 

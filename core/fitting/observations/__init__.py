@@ -1,6 +1,6 @@
 """Observations: one error term, one small file. Each has residuals of unit weight and their analytic Jacobian.
 
-Most observe one frame; `MaterialSteps` ties two.
+Most observe one frame; `MaterialSteps` and `ImageSteps` tie two.
 """
 
 from typing import Protocol
@@ -10,7 +10,7 @@ import numpy as np
 from ..state import Block, BodyState, FromBlocks
 from .background import BackgroundExclusion
 from .joints import ClickedJoints, FootOnFloor, Keypoints
-from .material_step import MaterialSteps, StepsFromFixed
+from .material_step import ImageSteps, MaterialSteps, Steps, StepsFromFixed
 from .pose_priors import JointLimits, PosePrior
 from .self_collision import SelfCollision
 from .shape_priors import EqualRadii, Proportions, ShapePrior, Symmetry
@@ -25,6 +25,7 @@ __all__ = [
     "EqualRadii",
     "FootOnFloor",
     "FromBlocks",
+    "ImageSteps",
     "JointLimits",
     "Keypoints",
     "MaterialSteps",
@@ -33,6 +34,7 @@ __all__ = [
     "Proportions",
     "ShapePrior",
     "SilhouetteRays",
+    "Steps",
     "StepsFromFixed",
     "SurfacePoints",
     "Symmetry",

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...foundation.progress import Monitor
 from ...geometry.robust import mad_sigma
-from ..observations import Block, FromBlocks, MaterialSteps, Observation
+from ..observations import Block, FromBlocks, Observation, Steps
 from ..state import BodyState, ShapeParameters
 from .block_band import NormalEquations
 
@@ -101,7 +101,7 @@ class Problem:
 
     parameters: ShapeParameters
     observe: Callable[[int, BodyState], list[Observation]]
-    observe_step: Callable[[int, BodyState, BodyState], MaterialSteps | None] | None = None
+    observe_step: Callable[[int, BodyState, BodyState], Steps | None] | None = None
     shape_observations: Sequence[Observation] = ()
     shape_weight: float = 1.0
     free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
@@ -128,7 +128,7 @@ class Linearised:
     """Observations with their weights at one motion and shape; the cost and the normal equations there."""
 
     observations: list[list[tuple[Observation, np.ndarray | float]]]
-    steps: list[tuple[MaterialSteps, np.ndarray] | None]
+    steps: list[tuple[Steps, np.ndarray] | None]
     equations: NormalEquations
     cost: float = 0.0
     residuals: dict[str, list[np.ndarray]] = field(default_factory=dict)  # of robust observations, by kind
@@ -143,7 +143,7 @@ class Observed:
     """All observations of the frames and of the steps between them, made at one motion and shape."""
 
     frames: list[list[Observation]]  # T
-    steps: list[MaterialSteps | None]  # T − 1
+    steps: list[Steps | None]  # T − 1
 
 
 def observed(problem: Problem, at: Estimate) -> Observed:
@@ -162,7 +162,7 @@ def observed(problem: Problem, at: Estimate) -> Observed:
     return Observed(frames=frames, steps=steps)
 
 
-def _step(problem: Problem, t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+def _step(problem: Problem, t: int, a: BodyState, b: BodyState) -> Steps | None:
     return problem.observe_step(t, a, b) if problem.observe_step is not None else None
 
 
@@ -278,7 +278,7 @@ def _add_frame(
 
 
 def _add_step(
-    problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodyState, step: MaterialSteps | None, scale: float, factor: float
+    problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodyState, step: Steps | None, scale: float, factor: float
 ) -> None:
     if step is None:
         lin.steps.append(None)

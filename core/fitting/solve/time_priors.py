@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..observations import MaterialSteps, Observation
+from ..observations import Observation, Steps
 from ..state import BodyState
 from .block_band import NormalEquations, eliminated, reversed_in_time
 from .problem import Estimate, Problem, Scales, linearise
@@ -144,7 +144,7 @@ def marginal_prior(
     def observe(t: int, state: BodyState) -> list[Observation]:
         return problem.observe(t + first, state) if t + first in own else []
 
-    def step(t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+    def step(t: int, a: BodyState, b: BodyState) -> Steps | None:
         return observe_step(t + first, a, b) if observe_step and (t + first in own or t + first + 1 in own) else None
 
     smoothness = replace(coupling, acceleration=replace(coupling.acceleration, time_s=coupling.acceleration.time_s[frames]))

@@ -51,8 +51,7 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
             best, best_score = solution, score
     if best is not None:
         best, best_score = _better_around(fit, points, best, best_score, parts[-2])
-    support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
-    if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
+    if best is None or not (fit.tracks.joints(fit.click) or _is_seen(fit, points, best)):
         if not len(points.xyz_m):
             raise InputError(
                 f"Frame {points.frame} has no measured surface, and no outlines near the clicked joints; check the clicks and the rig, "
@@ -63,6 +62,14 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
             f"rig, or click in a frame where the limb was measured.{_not_clicked(fit)}"
         )
     return _shaped(fit, points, _with_lost_limbs(fit, points, best, best_score, parts[-1]), clicked.vector, monitor)
+
+
+def _is_seen(fit: FitContext, points: CloudPoints, body: Solution) -> bool:
+    """Whether enough points or outlines are about the body, or points that were followed in single views."""
+    pose, least = body.motion[0], fit.settings.min_points
+    if fit.support(fit.click, points, pose, body.vector) >= least:
+        return True
+    return fit.in_views is not None and fit.in_views.counts(fit.click, fit.parameters.state(pose, body.vector)).sum() >= least
 
 
 def _not_clicked(fit: FitContext) -> str:

@@ -25,7 +25,6 @@ from ..inputs.clicks import Clicks
 from ..inputs.cloud_points import thinned
 from ..inputs.fit_input import FitInput
 from ..inputs.keypoints import JointTracks
-from ..inputs.material_tracks import MaterialTracks
 from ..limb import Limb, whole_limbs
 from ..observations import Observation, PosePrior
 from ..settings import FitSettings
@@ -36,7 +35,7 @@ from .contradicted import contradicted_joints
 from .inverse_kinematics import dof_priors, pose_as_clicked
 from .long_sequence import FrameResults, Recording, frame_results
 from .sequence import PATCH, SLIGHT_SIGMAS, frame_statuses, posterior, standing, whole_sequence
-from .set_up import acceleration_sigmas, clicks_by_frame, context_of
+from .set_up import acceleration_sigmas, clicks_by_frame, context_of, point_tracks
 from .sigma_parts import CLOTH_M, known
 
 REACH_S = 0.4  # from a click to the last frame that it may change
@@ -93,7 +92,9 @@ def fit_again(
     limbs = limbs_with(part.fit.parameters, joints)
     problem = _held(whole_sequence(part), own, before)
     stays = problem.fixed if not limbs else np.setdiff1d(np.arange(before.shape[1]), np.concatenate([limb.columns for limb in limbs]))
-    start = Estimate(motion=_as_clicked(part.fit, before, vector, own), vector=vector)
+    motion = _as_clicked(part.fit, before, vector, own)
+    motion[:, stays] = before[:, stays]  # whatever was clicked before in these frames
+    start = Estimate(motion=motion, vector=vector)
     adjusted = replace(problem, free_shape=NO_SHAPE, fixed=stays)
     solution = solve(adjusted, start, steps=settings.sequence_steps, monitor=monitor, stage=STAGE, slight_sigmas=SLIGHT_SIGMAS)
     covariance = posterior(part, problem, solution, _shape_covariance(part.fit, earlier.shape))
@@ -126,14 +127,13 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
     points = [thinned(cloud, settings.voxel_m) for cloud in given.clouds]
     fit = replace(fit, monitor=monitor).with_exact_outlines(points)
     observed = np.ones(earlier.values.shape, dtype=bool)
-    tracked = settings.use_trajectories and given.trajectories is not None
     whole = Recording(
         fit=fit,
         frames=given.frames,
         points=points,
         time_s=given.time_s,
         sigma=acceleration_sigmas(fit, earlier.values, observed, earlier.time_s),
-        tracks=MaterialTracks(given.trajectories, given.frames, model.surface, settings) if tracked and given.trajectories else None,
+        tracks=point_tracks(given, fit),
         lengths=(body.vector()[body.layout.group("lengths")], np.full(len(earlier.shape.lengths_m), np.inf)),
         feet=standing(fit, before, body.vector(), given.time_s),
     )
@@ -183,7 +183,7 @@ def _as_clicked(fit: FitContext, before: np.ndarray, vector: np.ndarray, own: ra
     """The motion (T, D) with the limbs led to the clicks in each clicked frame, a change that fades out between them and the ends."""
     clicked = [t for t in sorted(fit.places) if t in own and np.isfinite(fit.places[t]).any()]
     if not clicked:
-        return before
+        return before.copy()
     none = np.zeros((1, before.shape[1]))
     change = np.concatenate(
         [none, *(pose_as_clicked(fit.parameters, fit.places[t], before[t], vector)[None] - before[t] for t in clicked), none]

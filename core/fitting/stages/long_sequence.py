@@ -14,7 +14,7 @@ import numpy as np
 
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
-from ..inputs.material_tracks import MaterialTracks
+from ..inputs.material_tracks import PointTracks
 from ..limb import Limb, whole_limbs
 from ..observations.joints import StandingFeet
 from ..segmentation import crop
@@ -47,7 +47,7 @@ class Recording:
     points: Sequence[CloudPoints]  # T
     time_s: np.ndarray  # (T,)
     sigma: np.ndarray  # (D,) of accelerations
-    tracks: MaterialTracks | None
+    tracks: PointTracks | None
     lengths: tuple[np.ndarray, np.ndarray]  # see FitContext.shape_observations
     feet: StandingFeet | None
 

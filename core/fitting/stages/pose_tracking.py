@@ -21,7 +21,7 @@ import numpy as np
 from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
-from ..inputs.material_tracks import MaterialTracks
+from ..inputs.material_tracks import PointTracks
 from ..observations import Observation, PosePrior, StepsFromFixed
 from ..segmentation import SegmentationCache, crop
 from ..solve.problem import Estimate
@@ -99,7 +99,7 @@ class PoseTracking:
     points: Sequence[CloudPoints]  # T
     time_s: np.ndarray  # (T,)
     first: Solution  # of the click frame
-    tracks: MaterialTracks | None
+    tracks: PointTracks | None
 
     def state(self, pose: np.ndarray) -> BodyState:
         """The body in a pose (D,)."""
@@ -238,12 +238,12 @@ def _predictions(motion: np.ndarray, time_s: np.ndarray, tracked: list[int], t: 
     return [last + rate * (time_s[t] - time_s[tracked[-1]]), last]  # (1)
 
 
-def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, direction: int) -> list[StepsFromFixed]:
+def _from_neighbour(tracks: PointTracks | None, t: int, before: BodyState, direction: int) -> list[StepsFromFixed]:
     """The observations of frame t by tracked points, with the neighbour's body fixed."""
     if tracks is None:
         return []
-    steps = tracks.steps(t - 1, before, None) if direction > 0 else tracks.steps(t, None, before)
-    return [] if steps is None else [StepsFromFixed(steps=steps, other=before, backwards=direction < 0)]
+    found = tracks.from_fixed(t - 1 if direction > 0 else t, before, direction < 0)
+    return [] if found is None else [found]
 
 
 def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np.ndarray, float | None]:
@@ -265,7 +265,9 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
         pose, support, score = _adjusted(given, target, start, monitor)
         if score > best_score + fit.least_gain and support > best_support - LARGEST_LOSS:
             best, best_support, best_score = pose, support, score
-    return (best, best_support) if best_support >= fit.settings.min_points or fit.joints(i) else (target.starts[0], None)
+    followed = sum(steps.size for steps in target.from_neighbour) if fit.in_views is not None else 0
+    seen = max(best_support, followed) >= fit.settings.min_points or fit.joints(i)
+    return (best, best_support) if seen else (target.starts[0], None)
 
 
 def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monitor: Monitor) -> tuple[np.ndarray, float, float]:

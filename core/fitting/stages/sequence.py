@@ -31,7 +31,6 @@ from ...foundation.progress import Monitor
 from ..context import NO_SHAPE, FitContext
 from ..inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints, thinned
 from ..inputs.fit_input import FitInput
-from ..inputs.material_tracks import MaterialTracks
 from ..inputs.start_joints import NeedsClick
 from ..observations import Observation
 from ..observations.joints import StandingFeet
@@ -66,7 +65,7 @@ from .long_sequence import (
     sample,
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
-from .set_up import acceleration_sigmas, fit_context, with_start
+from .set_up import acceleration_sigmas, fit_context, point_tracks, with_start
 from .sigma_parts import known, sigma_parts
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
@@ -109,9 +108,9 @@ def fit_and_start(
 ) -> tuple[BodyFit, SequenceStart]:
     """`fit_sequence`, and where a further adjustment of the same frames starts (`fit_from`)."""
     given = with_start(given, settings, monitor)
-    fit, points = _prepared(given, settings, monitor)
+    fit, points = prepared(given, settings, monitor)
     first = fit_click_frame(fit, points[fit.click], monitor)
-    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=_material_tracks(given, fit))
+    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=point_tracks(given, fit))
     motion, observed = track_poses(tracking, monitor, checkpoints)
     motion = follow_limbs(tracking, motion, monitor)
     if given.start is not None and (contradicted := taken_back(fit, given.start, points, motion, first.vector, monitor)):
@@ -127,22 +126,16 @@ def fit_from(
 
     It starts from the tracked poses, and not from the first adjustment: that one ended where further steps follow the model's errors.
     """
-    fit, points = _prepared(given, settings, monitor)
-    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=start.first, tracks=_material_tracks(given, fit))
+    fit, points = prepared(given, settings, monitor)
+    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=start.first, tracks=point_tracks(given, fit))
     return _adjusted_body(given, tracking, start, monitor, checkpoints)
 
 
-def _prepared(given: FitInput, settings: FitSettings, monitor: Monitor) -> tuple[FitContext, Sequence[CloudPoints]]:
+def prepared(given: FitInput, settings: FitSettings, monitor: Monitor) -> tuple[FitContext, Sequence[CloudPoints]]:
     """The context, and the thinned points of all frames."""
     fit = replace(fit_context(given, settings), monitor=monitor)
     points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     return fit, _read(points, monitor) if len(points) <= AT_ONCE else points
-
-
-def _material_tracks(given: FitInput, fit: FitContext) -> MaterialTracks | None:
-    if given.trajectories is None or not fit.settings.use_trajectories:
-        return None
-    return MaterialTracks(given.trajectories, given.frames, fit.model.surface, fit.settings)
 
 
 def _adjusted_body(
@@ -348,7 +341,7 @@ def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> floa
     sigmas = np.concatenate([p.sigma_m for p in points])
     own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + VARIANCE_FLOOR_M2
     model, frames = settings.model_sigma_m**2, float(len(points))
-    if settings.balls != "one":
+    if settings.balls != "one" and len(sigmas):
         frames = min(frames, settings.shared_frames)
     return (own + frames * model) / (own + model)
 

@@ -16,7 +16,9 @@ from ..inputs.background import BackgroundRegions
 from ..inputs.clicks import Clicks, initial_clicks, read_clicks
 from ..inputs.cloud_points import CloudPoints, thinned
 from ..inputs.fit_input import FitInput
+from ..inputs.image_tracks import ImageTracks
 from ..inputs.keypoints import JointTracks
+from ..inputs.material_tracks import MaterialTracks, PointTracks
 from ..inputs.silhouettes import Silhouettes
 from ..inputs.start_joints import NeedsClick, StartJoints
 from ..observations import ClickedJoints, Keypoints, Observation
@@ -203,8 +205,16 @@ def context_of(given: FitInput, settings: FitSettings, model: BodyModel, shape: 
         silhouettes=Silhouettes(given, model.surface, settings),
         background=BackgroundRegions(given, parameters, settings),
         collisions=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
+        in_views=ImageTracks(given.rig, given.image_tracks, model.surface, settings) if given.image_tracks else None,
         **own,  # type: ignore[arg-type]
     )
+
+
+def point_tracks(given: FitInput, fit: FitContext) -> PointTracks | None:
+    """The points that were followed from frame to frame, if there are any: in space, or else in single views."""
+    if given.trajectories is None or not fit.settings.use_trajectories:
+        return fit.in_views
+    return MaterialTracks(given.trajectories, given.frames, fit.model.surface, fit.settings)
 
 
 def _model_shape(model: BodyModel, settings: FitSettings) -> BodyShape:

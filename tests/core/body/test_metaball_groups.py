@@ -65,3 +65,9 @@ def test_a_limb_alone_is_one_group() -> None:
     shape = default_shape(read_model("arm.R"))
     (only,) = metaball_groups(shape)
     assert np.array_equal(only.bone_index, shape.metaballs.bone_index) and np.array_equal(only.weight, shape.metaballs.weight)
+
+
+def test_no_point_has_no_normal(shape: BodyShape) -> None:
+    """A body whose metaballs enclose nothing leaves none on its surface."""
+    surface, none = WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names))), np.zeros((0, 3))
+    assert surface.normals(none, np.zeros(0, dtype=int)).shape == (0, 3) and surface.distance_m(none, np.zeros(0, dtype=int)).shape == (0,)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core.fitting.inputs import background
 from tricap.core.fitting.inputs.background import find_background
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -55,6 +56,32 @@ def test_who_never_moves_is_told_by_the_background_in_take_toml(tmp_path: Path, 
     cv2.imwrite(str(take / "empty.png"), scenes.render(rig["C"], [], background=200.0))
     with pytest.raises(InputError, match="is nothing like view C in any frame"):
         find_background(open_take(read_take(take)), clouds, Monitor())
+
+
+def test_the_background_is_not_learnt_where_the_body_is_said_to_be(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board in five of eight frames at one place, and elsewhere in the others; without measured points."""
+    rig, boards = scenes.three_cameras(), [scenes.Body(half_m=(0.2, 0.15), t=scenes.Body().t + (x, 0.0, 0.0)) for x in (-0.1, 0.5)]
+    places = [0, 0, 0, 0, 0, 1, 1, 1]
+    footage = open_take(read_take(scenes.write_take(tmp_path, rig, [[boards[i]] for i in places], more='[body]\nmodel = "arm.R"')))
+    clouds: list[Any] = [SimpleNamespace(frame=t, xyz_m=np.zeros((0, 3))) for t in range(8)]
+    grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 15), np.linspace(-0.15, 0.15, 12), [0.0]), axis=-1).reshape(-1, 3)
+    given, real = list[Any](), background.still_background
+
+    def learnt(images: Any, near: Any, seen: Any, cell_px: int) -> Any:
+        given.append((near, cell_px))
+        return real(images, near, seen, cell_px)
+
+    monkeypatch.setattr(background, "still_background", learnt)
+    monkeypatch.setattr(background, "in_threads", lambda work, of: [work(k) for k in of])  # view after view, as `given` is read
+    views = find_background(footage, clouds, Monitor(), bodies=[grid + boards[i].t for i in places])
+    assert [view.estimated for view in views] == [True] * 3 and len(given) == 3
+    for camera, (near, size) in zip(rig.cameras, given):
+        for t in (2, 6):
+            board = cells(scenes.render(camera, [boards[places[t]]], background=-1.0) >= 0, size)
+            assert near[t][board == 1].all() and not near[t][cv2.dilate(board, np.ones((41, 41))) == 0].any()
+    shown = views[1].of_frame(2)
+    board = cells(scenes.render(rig["C"], [boards[0]], background=-1.0) >= 0, views[1].step_px)
+    assert shown is not None and (shown[cv2.erode(board, np.ones((5, 5))) == 1] == 0).mean() > 0.95
 
 
 def _with_source(take: Path, line: str) -> Path:

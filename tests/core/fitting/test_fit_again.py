@@ -1,6 +1,7 @@
 """Frames around a click are fitted again with the shape as it was: the lost limb is found, and nothing else moves."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages.fit_again import HELD, EarlierFit, _about_earlier, around, fit_again, limbs_with, with_held
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.foundation.progress import Cancelled, Monitor
+
+from .limb_scene import front_rig
 
 CLICK, BENT = 12, np.radians(40)
 
@@ -68,6 +71,33 @@ def test_a_lost_limb_follows_its_click(make_scene) -> None:
     stopped.cancel()
     with pytest.raises(Cancelled):
         fit_again(given, earlier, rows, ["wrist.R"], FitSettings(), stopped)
+
+
+def test_limbs_that_were_clicked_earlier_stay_where_the_fit_put_them() -> None:
+    """All joints were clicked in frame 3, the knees badly, and now the right wrist is pulled in frame 5."""
+    shape = default_shape(read_model("full"))
+    shape = replace(shape, length_sigma_m=0.01 * shape.lengths_m, radius_sigma_m=0.05 * shape.metaballs.radii_m)
+    rig, skeleton, frames = front_rig(focal_px=900.0), shape.skeleton, range(10)
+    values = np.zeros((len(frames), len(skeleton.dofs)))
+    values[:, skeleton.layout["elbow.R flexion"]] = values[:, skeleton.layout["elbow.L flexion"]] = np.radians(30)
+    clicked, pulled = values[3].copy(), values[5].copy()
+    clicked[skeleton.layout["knee.L flexion"]] = np.radians(25)
+    pulled[skeleton.layout["elbow.R flexion"]] = np.radians(45)
+    clicks = {
+        frame: {name: {c.name: c.project(X) for c in rig.cameras} for name, X in joints.items() if names is None or name in names}
+        for frame, pose, names in ((3, clicked, None), (5, pulled, {"wrist.R"}))
+        for joints in [joint_positions(skeleton, shape.lengths_m, pose)]
+    }
+    none, time_s = np.zeros((0, 3)), np.arange(10) / 25
+    clouds = [SimpleNamespace(frame=t, xyz_m=none, normals=none, covariance_m2=np.zeros((0, 3, 3))) for t in frames]
+    given = FitInput(rig=rig, model="full", clouds=clouds, clicks=clicks, time_s=time_s)
+    earlier = EarlierFit(
+        shape=shape, frames=np.arange(10), time_s=time_s, values=values, common_m=np.full(len(skeleton.joint_names), 0.002)
+    )
+    motion = fit_again(given, earlier, range(10), ["wrist.R"], FitSettings(), Monitor())
+    arm = limbs_with(ShapeParameters(shape), ["wrist.R"])[0].columns
+    change = np.abs(motion.values - values)
+    assert change[5, arm].max() > np.radians(5) and np.delete(change, arm, axis=1).max() < 1e-9
 
 
 def test_what_the_fit_does_not_measure_stays_as_it_was() -> None:

@@ -1,6 +1,7 @@
 """Recordings whose surface cannot be measured: a blank scene with an arm that has only keypoints or outlines."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,13 @@ from tricap.core.fitting.inputs.no_surface import background_outside_outlines, f
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.raster import rasterize
+from tricap.core.geometry.rig import Rig
+from tricap.core.geometry.rotation import axis_rotation
 from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
 from tricap.core.run import pipeline, take_run
 from tricap.core.run.record import read_frame_table
+from tricap.core.synthetic import arm
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 from tricap.core.tracking.contour import contour_of_mask, outward_normals
@@ -107,6 +111,31 @@ def test_between_cameras_all_around_nothing_is_measured(tmp_path: Path, monkeypa
     assert _run(tmp_path / "out")["stages"]["measure"]["not_done"] == "the views look from too far apart"
     with take_run.open_run(takes["none"], tmp_path / "surface") as job, pytest.raises(InputError, match="tried"):
         pipeline.measure(job, Monitor())
+
+
+def _wide_rig(width_px: int) -> Rig:
+    """The cameras of the synthetic arm, the outer ones turned about it to 55° from the middle one."""
+    rig, cameras = arm.arm_rig(width_px), []
+    for camera, degrees in zip(rig.cameras, (-45.0, 0.0, 45.0)):
+        turn = axis_rotation("z", np.radians(degrees))
+        centre = arm.TARGET_M + turn @ (camera.centre_m - arm.TARGET_M)
+        R = camera.R_cam_world @ turn.T
+        cameras.append(replace(camera, R_cam_world=R, t_cam_world_m=-R @ centre))
+    return replace(rig, cameras=tuple(cameras))
+
+
+@pytest.mark.slow
+def test_between_cameras_all_around_a_body_is_held_by_points_of_single_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arm, "rig_for", lambda subject, width_px: _wide_rig(width_px))
+    take, errors = tmp_path / "take", dict[bool, np.ndarray]()
+    arm.make_arm_take(take, arm.ArmTakeSettings(frames=12, width_px=480, interlaced="none", click_error_px=1.0), Monitor())
+    truth = np.load(take / "truth.npz")["joints_m"]
+    for tracks in (True, False):
+        job = pipeline.run(take, tmp_path / str(tracks), {"fitting": {"use_trajectories": tracks}})
+        assert job.body is not None and job.surfaceless and _run(job.results.folder)["stages"]["fit"]["iterations"] > 0
+        errors[tracks] = np.linalg.norm(job.body.motion.joints_m - truth, axis=2)
+        assert not (job.results.folder / "cache" / "fit_rough").exists()
+    assert errors[True].mean() < 0.8 * errors[False].mean() and errors[True].max() < 0.03, {k: e.mean(axis=0) for k, e in errors.items()}
 
 
 def test_what_lies_outside_an_outline_is_empty(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from tricap.core.fitting.observations import (
     ClickedJoints,
     EqualRadii,
     FootOnFloor,
+    ImageSteps,
     JointLimits,
     Keypoints,
     MaterialSteps,
@@ -159,22 +160,30 @@ def test_jacobians_equal_differences(model: str, seed: int, weights: bool) -> No
         assert np.array_equal(observation.jacobian(state(x), shape=False), J[:, : len(motion)])
 
 
+def _steps(parameters: ShapeParameters, rng: np.random.Generator, in_view: bool) -> MaterialSteps | ImageSteps:
+    bone, sigma = np.arange(20) % len(parameters.skeleton.bones), rng.uniform(0.001, 0.005, 20)
+    from_m, to_m = rng.normal(0, 0.3, (2, 20, 3))
+    if in_view:
+        return ImageSteps(from_m=from_m, ray_m=to_m, across=rng.normal(size=(20, 2, 3)), bone=bone, sigma_m=sigma)
+    return MaterialSteps(from_m=from_m, to_m=to_m, bone=bone, sigma_m=sigma)
+
+
+@pytest.mark.parametrize("in_view", [False, True])
 @pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
-def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> None:
+def test_jacobian_of_a_step_between_frames_equals_differences(model: str, in_view: bool) -> None:
     rng = np.random.default_rng(3)
     parameters = _parameters(model)
     vector, D = parameters.vector(), len(parameters.skeleton.dofs)
     x = np.concatenate([_motion(parameters, rng), _motion(parameters, rng), vector])
     names = [f"{name} of frame {k}" for k in "ab" for name in parameters.skeleton.dof_names] + list(parameters.layout.names)
-    bone = np.arange(20) % len(parameters.skeleton.bones)
-    steps = MaterialSteps(
-        from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)), bone=bone, sigma_m=rng.uniform(0.001, 0.005, 20)
-    )
+    steps = _steps(parameters, rng, in_view)
 
     def states(x):
         return parameters.state(x[:D], x[2 * D :]), parameters.state(x[D : 2 * D], x[2 * D :])
 
-    J = steps.jacobian(*states(x))
+    J = np.zeros((steps.size, len(x)))
+    for rows, columns, block in steps.blocks(*states(x)):
+        J[rows[:, None], columns] = block
     for k, name in enumerate(names):
         h = np.zeros(len(x))
         h[k] = STEP
@@ -182,21 +191,17 @@ def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> Non
         assert np.abs(J[:, k] - difference).max() / np.abs(J).max() < TOLERANCE, name
 
 
+@pytest.mark.parametrize("in_view", [False, True])
 @pytest.mark.parametrize("model", ["arm.R", "full"])
 @pytest.mark.parametrize("backwards", [False, True])
-def test_jacobian_of_a_step_from_a_fixed_frame_equals_differences(model: str, backwards: bool) -> None:
+def test_jacobian_of_a_step_from_a_fixed_frame_equals_differences(model: str, backwards: bool, in_view: bool) -> None:
     """The other frame's pose is fixed; its body is the same, so the shape moves both."""
     rng = np.random.default_rng(4)
     parameters = _parameters(model)
     D, other = len(parameters.skeleton.dofs), _motion(parameters, rng)
     x = np.concatenate([_motion(parameters, rng), parameters.vector()])
     names = (*parameters.skeleton.dof_names, *parameters.layout.names)
-    steps = MaterialSteps(
-        from_m=rng.normal(0, 0.3, (20, 3)),
-        to_m=rng.normal(0, 0.3, (20, 3)),
-        bone=np.arange(20) % len(parameters.skeleton.bones),
-        sigma_m=rng.uniform(0.001, 0.005, 20),
-    )
+    steps = _steps(parameters, rng, in_view)
 
     def observed(x):
         return StepsFromFixed(steps=steps, other=parameters.state(other, x[D:]), backwards=backwards), parameters.state(x[:D], x[D:])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.fitting.inputs.fit_input import BackgroundDistances, Packed
+from tricap.core.fitting.inputs.fit_input import UNKNOWN, BackgroundDistances, Packed
 from tricap.core.fitting.inputs.silhouettes import PersonOutlines, Silhouettes
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.state import ShapeParameters
@@ -58,6 +58,17 @@ def test_none_is_at_the_border_of_the_image() -> None:
     away = (xy - (STEP_PX - 1) / 2) / STEP_PX - (70, 95)
     radius = np.linalg.norm(away, axis=1)
     assert np.abs(radius - 30).max() < 2.0 and (np.einsum("ni,ni->n", away, normal) > 0.8 * radius).all()
+
+
+def test_none_is_where_nothing_is_known_of_the_background() -> None:
+    """A person of whom the left half stands before a wall that was never seen."""
+    r = _from(MIDDLE)
+    table = np.where(r < 30, 0, np.where(I < MIDDLE[0], UNKNOWN, 9))
+    regions = BackgroundDistances(view="C", frame=np.array([5]), distance=Packed([table]), step_px=STEP_PX, unit_px=0.5)
+    found, all_around = PersonOutlines(regions=regions, beside_unknown=False).of_frame(5), PersonOutlines(regions=regions).of_frame(5)
+    assert found is not None and all_around is not None and len(all_around[0]) > 1.8 * len(found[0])
+    xy, normal, _ = found
+    assert (xy[:, 0] > (MIDDLE[0] - 1) * STEP_PX).all() and len(xy) > 60 and normal[:, 0].min() > -0.2
 
 
 def test_specks_have_none_nor_frames_in_which_nothing_is_known() -> None:
