@@ -10,7 +10,7 @@ from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
 from ..core.body.skin.mesh import DETAIL
-from ..core.cli.arguments import check_simplify, standard_output_kept_clean
+from ..core.cli.arguments import check_simplify, refuse_unused, standard_output_kept_clean
 from ..core.foundation import bounded
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
@@ -142,6 +142,11 @@ def _check(args: argparse.Namespace) -> None:
     for name, value in (("from", args.start_deg), ("turn", args.turn_deg), ("elevation", args.elevation_deg)):
         if not abs(value) <= MOST_DEG[name]:  # nor NaN
             raise InputError(f"--{name} {value:g} is out of range; choose an angle of {-MOST_DEG[name]:g} to {MOST_DEG[name]:g} degrees.")
+    angles = {"--from": args.start_deg != FROM_DEG, "--turn": args.turn_deg != TURN_DEG, "--elevation": args.elevation_deg != ELEVATION_DEG}
+    if args.film is None:
+        refuse_unused(angles, "moves the camera of --film, which was not given")
+    if not args.implicit:
+        refuse_unused({"--field": args.field != EXPONENTIAL.name}, "is the field function of --implicit, which was not given")
     movies = ("--turntable", args.turntable, ".mp4"), ("--film", args.film, ".mp4")
     named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), *movies)
     if all(path is None for _, path, _ in named):

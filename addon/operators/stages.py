@@ -92,20 +92,13 @@ def report_run(operator: Any, context: bpy.types.Context, run: "Run") -> None:
 
 def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> "Run":
     """The computation, without bpy. Frames that have a checkpoint are not computed again."""
-    from ...core.fitting.inputs.take_inputs import check_body
-    from ...core.run import pipeline
     from ...core.run.engine import of_this_machine
-    from ...core.run.phases import course_of
+    from ...core.run.pipeline import do_stages
     from ...core.run.take_run import open_run
 
     with open_run(take, out, overrides) as run:
-        if "fit" in names:
-            check_body(run.footage, run.settings["fitting"])
         run.engine = of_this_machine()
-        monitor.course = course_of(names, len(run.footage.frames))
-        for name in names:
-            monitor.begin(name)
-            getattr(pipeline, name)(run, monitor)
+        do_stages(run, names, monitor)
     return run
 
 

@@ -119,7 +119,7 @@ def track_outline(take: Path, out: Path, overrides: Overrides, view: str, monito
     from ...core.cli.contour import write_contours
     from ...core.run.take_run import open_run
 
-    with open_run(take, out, overrides, ignore_contours=True) as run:
+    with open_run(take, out, overrides, for_contours=True, needs_body=start.body) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
         return [*write_contours(run, names, monitor, start), *run.notes]
 

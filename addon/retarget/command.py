@@ -6,13 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ...core.cli.arguments import check_not_read, check_simplify, standard_output_kept_clean
+from ...core.cli.arguments import check_not_read, check_simplify, refuse_unused, standard_output_kept_clean
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.results.folder import check_not_result
+from ...core.results.outputs import check_replaceable
 
+FORMAT, PICTURE = "tricap-retarget", "picture"  # of the figures of --report; and their entry with the digest of its picture
 # those of programs.py and of core/motion/formats/markers.py, which are imported when a command runs
 PROGRAM_NAMES = ("plain", "mixamo", "unreal", "unity", "maya", "motionbuilder", "opensim")
 UNITS = ("m", "meters", "metres", "dm", "cm", "mm", "um", "in", "inch")
@@ -81,6 +83,17 @@ def _add_axes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unit", choices=UNITS, default="", help="the unit of such a file, if not the one stated in it")
 
 
+def _check_axes(args: argparse.Namespace) -> None:
+    """--up and --unit are those of a file that is read and may not state them.
+
+    Raises:
+        InputError: it is another file, or the folder of a run.
+    """
+    if args.out.is_dir() or (args.out.is_file() and args.out.suffix.lower() not in (".bvh", ".trc", ".c3d", ".csv")):
+        why = f"is that of a BVH, TRC, C3D or CSV file that is read, and {args.out} is none (--preset chooses what is written)"
+        refuse_unused({"--up": bool(args.up), "--unit": bool(args.unit)}, why)
+
+
 def _need_blender(what: str) -> None:
     if importlib.util.find_spec("bpy") is None:
         raise InputError(f"`tricap {what}` needs Blender: install bpy in this Python, or use `blender --command tricap {what} …`.")
@@ -94,6 +107,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         Cancelled: the monitor was cancelled; no file was written.
     """
     _need_blender("retarget")
+    _check_axes(args)
     import bpy
 
     from ...core.motion.retarget.contacts import FeetSettings
@@ -109,7 +123,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     check_not_read("--out", args.blend, args.rig)
     if args.report:
         check_not_read("--report would overwrite an input:", args.blend.with_suffix(".json"), args.map)
-        _check_replaceable_report(args.blend)
+        _check_replaceable_report(args.blend.with_suffix(".json"), args.blend.with_suffix(".png"))
     table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
@@ -127,7 +141,8 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         from .picture import draw
 
         draw(args.blend.with_suffix(".png"), motion, source.map, armature_object, result.motion, target.rig_map)
-        store.write_json(args.blend.with_suffix(".json"), table)
+        picture = store.digest(args.blend.with_suffix(".png"))
+        store.write_json(args.blend.with_suffix(".json"), table | {PICTURE: picture})
     kept = save_blend(args.blend)
     if args.json:
         import json
@@ -136,18 +151,24 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in [*outcome.notes, kept] if note)]
 
 
-def _check_replaceable_report(blend: Path) -> None:
-    """A report next to no such .blend file is not of an earlier retargeting."""
-    for file in (blend.with_suffix(".json"), blend.with_suffix(".png")):
-        if file.exists() and not blend.exists():
-            raise InputError(f"--report would overwrite {file}, which is not of an earlier {blend.name}; choose another name for --out.")
+def _check_replaceable_report(figures: Path, picture: Path) -> None:
+    """Check that the files of a report, if they are there, are of an earlier one; its figures have a digest of its picture.
+
+    Raises:
+        InputError: they are not, or the picture was changed.
+    """
+    check_replaceable(figures, f'{{\n "format": "{FORMAT}"')
+    if not figures.exists():
+        check_replaceable(picture)
+    elif picture.exists() and store.digest(picture) != store.read_json(figures).get(PICTURE, store.digest(picture)):
+        raise InputError(f"{picture} would be overwritten, and was changed since; rename it, or choose another name for --out.")
 
 
 def outcome_table(outcome: Any, source_map: Any, target_map: Any) -> dict[str, Any]:
     """The outcome of a retargeting, as the table of --json and --report. `outcome`: apply.Outcome; maps: RigMap."""
     figures, result = outcome.figures, outcome.result
     return {
-        "format": "tricap-retarget",
+        "format": FORMAT,
         "version": 1,
         "frames": figures.frames,
         "keys": outcome.written.keys,
@@ -174,6 +195,9 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: OUT lacks the data, or the input is invalid.
         Cancelled: the monitor was cancelled.
     """
+    _check_axes(args)
+    if args.format == "ply":
+        refuse_unused({"--preset": args.preset != "plain"}, "changes no PLY files, which are copied as they are")
     from .export import BY_BLENDER, export_file, named_for
     from .programs import is_imported_by_blender
 

@@ -22,6 +22,7 @@ from ...core.motion.tables import read_joints
 from ...core.results.folder import check_not_result, lost
 from ...core.results.listed_files import PLY, check_files, list_files
 from ...core.results.outputs import check_output
+from ...core.results.own_files import files_of
 from ...core.results.run_json import read_run
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
@@ -180,7 +181,7 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program, mov
 
 def _copy_ply(out: Path, folder: Path, of: str) -> str:
     """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
-    files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := sorted((out / name).glob("*.ply")))), None)
+    files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := list(files_of(out / name, name)))), None)
     if files is None:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     check_files(folder, PLY)

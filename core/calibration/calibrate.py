@@ -18,6 +18,7 @@ from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
 from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart, read_image
 from ..results.listed_files import PICTURES, check_files
+from ..results.outputs import check_replaceable
 from . import report, verdict
 from .bar_lenses import calibrate_bar
 from .bars import BarObservations
@@ -313,16 +314,18 @@ def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     return replace(calibration, network=moved, other=other, unknowns=replace(calibration.unknowns, block=other.block))
 
 
-FIGURES = "calibration.json"
+PAGE, FIGURES = "calibration.txt", "calibration.json"
 
 
 def check_report(folder: Path) -> None:
-    """Check that a folder has no images but those of an earlier report.
+    """Check that a folder has no images, page or figures but those of an earlier report.
 
     Raises:
         InputError: it has.
     """
-    if not (folder / FIGURES).is_file():
+    check_replaceable(folder / FIGURES, report.START)
+    if not (folder / FIGURES).exists():
+        check_replaceable(folder / PAGE)
         check_files(folder, PICTURES)
 
 
@@ -335,7 +338,7 @@ def write_report(folder: Path, result: CalibratedRig) -> list[Path]:
     calibration, quality, judged = result.calibration, result.quality, result.verdict
     folder = Path(folder)
     check_report(folder)
-    paths = [folder / "calibration.txt", folder / FIGURES]
+    paths = [folder / PAGE, folder / FIGURES]
     store.write_text(paths[0], report.page(calibration, quality, judged))
     store.write_json(paths[1], report.figures(calibration, quality, judged))
     for name, picture in pictures(calibration, quality).items():

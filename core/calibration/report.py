@@ -19,13 +19,15 @@ INK, PALE, RED, GREEN, BLUE = (60, 60, 60), (225, 225, 225), (60, 60, 220), (90,
 PANEL_PX = 420
 MAP_CELLS = 28  # along each side of the error map
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+FORMAT = "tricap-calibration"
+START = f'{{\n "format": "{FORMAT}"'  # of the figures as a file
 
 
 def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dict[str, Any]:
     """All figures as plain values, lengths in metres."""
     observations = calibration.observations
     return {
-        "format": "tricap-calibration",
+        "format": FORMAT,
         "version": 1,
         "light": verdict.light.value,
         "verdict": verdict.sentence,

@@ -48,7 +48,8 @@ def check_rig(path: Path) -> Checked:
 
 def geometry_findings(rig: Rig) -> list[Finding]:
     """Cameras with implausible interior orientations, cameras at the same position, and cameras without a common field of view."""
-    findings = [finding for camera in rig.cameras for finding in _interior(camera)]
+    findings = [doubtful(Cause.INPUT, remark, "Correct the file, or calibrate again.") for remark in rig.remarks]
+    findings += [finding for camera in rig.cameras for finding in _interior(camera)]
     if len(rig.cameras) > 1:
         longest = max(_bases(rig.cameras).values())
         for pair, base in _bases(rig.cameras).items():
@@ -85,7 +86,7 @@ def wide_findings(cameras: Sequence[Camera], reference: int) -> list[Finding]:
         f"{WIDEST_DEG:.0f}°, so "
     )
     if no_view_alike(cameras, reference):
-        sentence += "no surface is measured: the body is fitted to the person's outlines and clicked joints alone."
+        sentence += "no surface is measured: the body is fitted to outlines, clicked joints, and points followed in single views."
         return [doubtful(Cause.FAR_APART, sentence, "For a surface, place neighbouring cameras at most 30° apart.")]
     sentence += "hardly any surface will be measured."
     return [doubtful(Cause.FAR_APART, sentence, "Place neighbouring cameras at most 30° apart.")]

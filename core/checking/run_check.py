@@ -15,7 +15,7 @@ from ..body.model_file import read_model, with_limits
 from ..body.motion import BodyFit, BodyMotion
 from ..body.shape import BodyShape, read_body
 from ..fitting.inputs.fit_input import FitInput
-from ..foundation import bounded, store
+from ..foundation import bounded, lock, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
@@ -23,7 +23,8 @@ from ..motion.formats.ply import read_ply
 from ..motion.tables import JointTable, MotionTable, read_joints, read_motion
 from ..results import blend_file
 from ..results.folder import lost
-from ..results.run_json import read_run
+from ..results.own_files import files_of
+from ..results.run_json import UNTIL, read_run
 from .findings import Cause, Checked, Finding, doubtful, wrong
 
 MOST_FRAMES = 10_000_000  # that a run.json may name
@@ -47,7 +48,7 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
         run = read_run(folder / "run.json")
         _refuse_parts(run, folder)
         findings += [*_warnings(run), *_complete(run, folder), *_same_inputs(run, folder), *_rays(run)]
-        if (folder / "clouds").is_dir():
+        if any(files_of(folder / "clouds", "clouds")):
             findings += _clouds(run, folder, figures, monitor)
         if (folder / "motion.csv").exists():
             findings += _body(folder, figures)
@@ -79,8 +80,14 @@ def _warnings(run: Mapping[str, Any]) -> list[Finding]:
 def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
     """Stages that were never finished, and missing files of finished ones."""
     findings, again = [], "Run the same command again; it resumes there."
+    if (folder / lock.NAME).is_file():
+        findings.append(
+            wrong(Cause.NOT_FINISHED, f"A run in {folder} was killed before its end, or is still at work ({lock.NAME}).", again)
+        )
     if "measure" not in run["stages"]:
-        return [wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
+        return [*findings, wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
+    if (last := run.get(UNTIL, "measure")) not in run["stages"]:
+        findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended before its stage “{last}” was done.", again))
     incomplete = lost(folder, run)
     for stage, files in NEEDED.items():
         done = "not_done" not in run["stages"].get(stage, {"not_done": True})

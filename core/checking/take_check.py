@@ -22,6 +22,7 @@ from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
 from ..take.take import Take, read_take
+from ..tracking.corrections import odd_regions
 from .findings import Cause, Checked, Finding, doubtful, remark, wrong
 from .openings import opening_findings
 from .rig_check import (
@@ -161,9 +162,11 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     film = Film(footage, survey(footage, monitor))
     fitting = from_table(FitSettings, footage.take.settings.get("fitting", {}), "[fitting]")
     wide = wide_findings(footage.rig.cameras, footage.take.reference) if fitting.use_surface else []
+    odd = odd_regions(footage.take.corrections, footage.rig)
     findings = [
         *geometry_findings(footage.rig),
         *wide,
+        *(doubtful(Cause.CLICKS, sentence, "See [[corrections]] in take.toml.") for sentence in odd),
         *([remark(Cause.REFERENCE_VIEW, footage.reference_note)] if footage.reference_note else []),
         *picture_findings(film.survey, names),
         *rate_findings(footage),

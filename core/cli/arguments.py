@@ -4,7 +4,7 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from ..foundation import bounded
 from ..foundation.errors import InputError
 
+DICTIONARY = "DICT_4X4_50"  # default of --dictionary
 MOST_DIGITS = 12  # of a frame number
 OUTPUTS = ("printed", "preview", "blend", "file", "report", "pictures")  # arguments that name what is written
 WITH_OUT = ("calibrate", "track2d", "fields")  # commands with a file, or some, for --out; those with a folder for a run check that
@@ -79,6 +80,17 @@ def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
     for path in read:
         if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
             raise InputError(f"{flag} {out} is also an input; choose another name, so that it is not overwritten.")
+
+
+def refuse_unused(given: Mapping[str, bool], why: str) -> None:
+    """Refuse an option that this call would ignore: the first of those that were given, by flag. `why` follows its name.
+
+    Raises:
+        InputError: there is one.
+    """
+    flag = next((flag for flag, is_given in given.items() if is_given), None)
+    if flag is not None:
+        raise InputError(f"{flag} {why}; leave it out.")
 
 
 def check_outputs(args: argparse.Namespace) -> None:

@@ -19,12 +19,13 @@ from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
+from ..images.interlace import BOTH
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
 from ..results.listed_files import check_files
 from ..results.outputs import check_output, check_replaceable
 from ..take.bar_file import STARTS, bar_path, write_bar
 from ..tracking.point_tables import read_points
-from .arguments import check_not_read
+from .arguments import DICTIONARY, check_not_read, refuse_unused
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -50,6 +51,7 @@ def _board(args: argparse.Namespace) -> Board | None:
     if args.board is None:
         if args.squares or args.square or args.marker or args.printed:
             raise InputError("--squares, --square, --marker and --print describe a board; give --board chessboard or --board charuco, too.")
+        refuse_unused({"--dictionary": args.dictionary != DICTIONARY}, "describes the markers of --board charuco, which was not given")
         if args.with_board is not None:
             raise InputError("--with-board needs the board; give --board chessboard or --board charuco, --squares and --square.")
     if args.lenses_only and args.with_board is None:
@@ -85,7 +87,21 @@ def _print(args: argparse.Namespace, board: Board | None) -> list[str]:
     ]
 
 
+def _refuse_images_options(args: argparse.Namespace) -> None:
+    """Refuse what describes the images or the adjustment of a calibration, where another tool's is converted.
+
+    Raises:
+        InputError: there is such an option.
+    """
+    absent = ("board", "report", "mask", "bar_length", "target_diameter", "focal_px", "with_board", "synchronise", "rates")
+    usual = {"interlaced": "none", "first_field": "odd", "lens": "auto"}
+    values = {name: vars(args)[name] != usual.get(name) for name in (*absent, *usual)}
+    flags = {f"--{name.replace('_', '-')}": given for name, given in values.items()}
+    refuse_unused(flags, "belongs to a calibration from images, and not to --import")
+
+
 def _convert(args: argparse.Namespace) -> list[str]:
+    _refuse_images_options(args)
     if args.format:
         check_not_read("--out", args.out, args.source)
         if any(args.source.match(name) for name in FOLDERS.get(args.format, ())):
@@ -110,6 +126,8 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
             "The bar's length is missing; give --bar-length with the distance between its two targets in metres, or --board with --squares "
             "and --square."
         )
+    if args.interlaced != BOTH:
+        refuse_unused({"--first-field": args.first_field != "odd"}, "belongs to --interlaced both")
     if args.focal_px is not None and not 10 < args.focal_px < 1e6:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     if not args.format and args.out.is_dir():

@@ -10,10 +10,11 @@ from ..images.sequence import read_image
 from ..results.outputs import check_replaceable
 from ..run import pipeline, take_run
 from ..run.outlines import MEASURED_SURFACE, Start, write_contour
+from ..run.settings import settings_of
 from ..surface.measure import NothingMeasured
 from ..take.take import Take, read_take
 from ..tracking.contour import HEAD
-from ..tracking.point_tables import read_polygon
+from ..tracking.point_tables import check_polygon, read_polygon
 from .arguments import frame_range, overrides
 
 
@@ -30,9 +31,11 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     )
     take = read_take(args.take)
     _check_views(take, args.view)
-    if start.polygon is not None and not read_rig(take.rig_path)[args.view[0]].sees(start.polygon).any():
-        raise InputError(f"The polygon {args.polygon} lies outside the image of view {args.view[0]}; write its pixels in the first frame.")
-    with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), ignore_contours=True) as job:
+    if start.polygon is not None:
+        spacing_px = settings_of(take.settings, overrides(args.set), str(args.take))["contour"].spacing_px
+        check_polygon(start.polygon, read_rig(take.rig_path)[args.view[0]], spacing_px, args.polygon)
+    given = args.take, args.out, overrides(args.set), frame_range(args.frames)
+    with take_run.open_run(*given, for_contours=True, needs_body=start.body) as job:
         return [*write_contours(job, args.view, monitor, start), *job.notes]
 
 
@@ -54,8 +57,8 @@ def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start:
     The take is measured and tracked first where that is needed. It is not needed with a background, which gives the outline in every frame.
     Where there is no surface (or fitting.use_surface is false), a contour that starts from a polygon is tracked in the images.
 
-    A body from which the contours start must belong to the same frames and settings. The contours make it stale, and the next fit replaces
-    it.
+    A body from which the contours start must belong to the same frames and settings (`open_run` with `needs_body`). The contours make it
+    stale, and the next fit replaces it.
 
     Raises:
         InputError: there is no such view, nothing to start from, or its file is not of an earlier call.
@@ -63,9 +66,6 @@ def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start:
     _check_views(job.footage.take, views)
     if len(views) > 1 and (start.polygon is not None or start.background is not None):
         raise InputError("A polygon or a background belongs to one view; give it with a single --view.")
-    if start.body and not job.results.path("skin").is_dir():
-        folder = job.results.folder
-        raise InputError(f"{folder} has no fitted body with a skin for these frames and settings; run `tricap fit` first.")
     for name in views:
         check_replaceable(job.results.path("contours", f"{name}.csv"), HEAD)
     own_start = start.polygon is not None or start.background is not None or start.body

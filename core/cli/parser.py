@@ -14,7 +14,7 @@ from ..body.model_file import model_names
 from ..foundation.progress import Monitor
 from ..images.interlace import BOTH, INTERLACE
 from . import streams
-from .arguments import named_path
+from .arguments import DICTIONARY, named_path
 
 # Adds a sub-command to the parser. The command's `run(args, monitor)` returns the lines to show, and sets `args.always_shown` to those
 # that --quiet does not suppress: findings and failures.
@@ -172,7 +172,7 @@ def _calibrate(commands: Any) -> None:
     parser.add_argument("--lenses-only", action="store_true", help=about)
     parser.add_argument("--squares", metavar="9x6", help="across and down: inner corners of a chessboard, squares of a ChArUco board")
     parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
-    parser.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
+    parser.add_argument("--dictionary", default=DICTIONARY, metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
     parser.add_argument("--marker", type=float, default=0.0, metavar="M", help="side of a marker in metres; three quarters of a square")
     about = "the model of the lenses; auto: the one that fits the images, with a board that of each camera"
     parser.add_argument("--lens", choices=LENSES, default="auto", help=about)

@@ -8,9 +8,10 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..report.film import write_film
-from ..results import blend_file
+from ..results import blend_file, films
 from ..results.folder import check_separate_folder
-from ..results.run_json import notes_of
+from ..results.own_files import CACHE
+from ..results.run_json import UNTIL, notes_of
 from ..run import pipeline, take_run
 from ..run.engine import Engine, of_this_machine
 from ..run.settings import settings_of
@@ -21,7 +22,7 @@ from ..synthetic.score import score_run
 from ..take.footage import open_take
 from ..take.take import read_take
 from . import points
-from .arguments import frame_range, overrides
+from .arguments import frame_range, overrides, refuse_unused
 
 MOST_ASKED = 1000  # workers
 
@@ -51,6 +52,8 @@ def track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """The trajectories of the surface's points, or of points that the user chose."""
     if args.pictures is not None and not args.points:
         raise InputError("--pictures draws the points of --points; without them, `tricap run` has pictures of the tracks in its report.")
+    if not args.points:
+        refuse_unused({"--points-frame": args.points_frame is not None}, "is the frame of --points, which were not given")
     return points.run(args, monitor) if args.points else _stages(("measure", "track"), args, monitor)
 
 
@@ -61,7 +64,7 @@ def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
-        job.engine = of_this_machine()
+        job.engine, job.record[UNTIL] = of_this_machine(), names[-1]
         for name in names:
             getattr(pipeline, name)(job, monitor)
         return _summary(job, args.json)
@@ -139,12 +142,15 @@ def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor)
 
 def _films(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Write the films that are missing: over every frame of every view, and where Blender is available, of the scene."""
-    lines, scene = [], job.results.path("scene.mp4")
-    if not job.results.path("film.mp4").is_file():
+    lines, folder = [], job.results.folder
+    films.check_ours(folder, job.results.read_run())
+    if not (folder / films.FILM).is_file():
         lines.append(f"Film: {write_film(job.footage, job.results, monitor)}")
-    if "scene" in _names_of(given.parser) and importlib.util.find_spec("bpy") is not None and not scene.is_file():
-        args = given.parser.parse_args(["scene", str(job.results.folder), "--film", str(scene), *(["--quiet"] if given.quiet else [])])
-        lines += [f"Film of the scene: {str(args.run(args, monitor)[-1])}"]
+    if "scene" in _names_of(given.parser) and importlib.util.find_spec("bpy") is not None and not (folder / films.SCENE_FILM).is_file():
+        part = folder / CACHE / films.SCENE_FILM
+        args = given.parser.parse_args(["scene", str(folder), "--film", str(part), *(["--quiet"] if given.quiet else [])])
+        args.run(args, monitor)
+        lines.append(f"Film of the scene: {films.place(part, folder, films.SCENE_FILM)}")
     return lines
 
 

@@ -15,12 +15,14 @@ from ..matching.least_squares import MatchingSettings
 from ..report.pictures import png
 from ..report.point_pictures import paths_over_footage
 from ..results.listed_files import PICTURES, check_files, list_files
+from ..results.outputs import check_replaceable
 from ..run.settings import Overrides
 from ..tracking.planar import PlanarTracks, track_planar
-from ..tracking.point_tables import ChosenPoints, read_points, write_planar
+from ..tracking.point_tables import PLANAR_HEAD, ChosenPoints, read_points, write_planar
 from ..tracking.settings import TrackingSettings, TrackStatus
 from .arguments import check_not_read, frame_range, overrides
 
+ENDING = ".csv"
 MIN_CORRELATION = 0.7  # default of matching.min_correlation here: faces have weak texture and deform
 MAX_SIGMA_PX = 0.4  # default of matching.max_sigma_px here, for the same reason
 WAIT_FRAMES = 100  # default of tracking.wait_frames here: a lost point is searched for only at its last place
@@ -38,6 +40,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     matching, tracking = settings_of_2d(tables)
     points, sequence = read_points(args.points), open_footage(args.sequence)
     check_not_read("--out", args.out, args.points, args.sequence)
+    if args.out.suffix.lower() != ENDING:
+        raise InputError(f"--out {args.out} is not the name of a table; let it end in {ENDING}.")
+    check_replaceable(args.out, PLANAR_HEAD)
     if args.pictures is not None:
         check_not_read("--pictures", args.pictures, *{path.parent for path in sequence.files()[:1]})
         check_files(args.pictures, PICTURES)

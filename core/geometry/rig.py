@@ -1,9 +1,10 @@
 """The camera rig and its file, rig.toml: the layout of Anipose, Pose2Sim and caliscope, in metres."""
 
+import difflib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ import numpy as np
 from ..foundation import bounded, store
 from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
-from .camera import Camera
+from .camera import EXTERIOR, INTERIOR, Camera
 from .rotation import rotation_from_vector, vector_from_rotation
 
 LARGEST_NUMBER = 1e12  # of a calibration in any unit; beyond it, powers of it overflow
 LARGEST_AFFINITY = 0.5  # pixels that are half as wide as the focal lengths say
 MOST_CAMERAS = 200  # much is done for every pair of them
+SIGMA_NAMES = (*INTERIOR, "k4", *EXTERIOR)  # of the unknowns in a camera's table “sigma”
+NEARLY = 0.8  # likeness of two names, from 0 to 1
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
@@ -27,11 +30,13 @@ class Rig:
     """Calibrated cameras, accessed by name. `metadata` is the quality that the calibration reported.
 
     `sigmas`: standard deviations by camera and unknown (f, cx, cy in px; k1 …; turn [rad] and shift [m] about the camera's own axes).
+    `remarks`: what its file lacks, or names nearly as a rig does, a sentence each.
     """
 
     cameras: tuple[Camera, ...]
     metadata: Mapping[str, Any] = field(default_factory=dict)
     sigmas: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Camera:
         for camera in self.cameras:
@@ -73,7 +78,34 @@ def read_rig(path: Path) -> Rig:
     check_cameras(cameras, f"The rig {path}")
     tables = [entry for key, entry in table.items() if key.startswith("cam")]
     sigmas = {c.name: sigmas_of(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
-    return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
+    return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas, remarks=tuple(_remarks(table, cameras, path)))
+
+
+def _remarks(table: Mapping[str, Any], cameras: Sequence[Camera], path: Path) -> Iterator[str]:
+    """A sentence for each camera without distortions, and for names at the top of a file that are nearly those of a rig. Other names are
+    those of other tools."""
+    tables = [entry for key, entry in table.items() if key.startswith("cam")]
+    for camera, entry in zip(cameras, tables):
+        if "distortions" not in entry:
+            yield f"Camera “{camera.name}” of {path.name} has no `distortions`: its lens counts as free of distortion."
+        for key in entry.get("sigma", {}):
+            if key not in SIGMA_NAMES:
+                yield f"`sigma` of camera “{camera.name}” of {path.name} has “{key}”, which is no unknown.{nearest_name(key, [*INTERIOR])}"
+        if "sigma" not in entry and (key := _nearly("sigma", entry)):
+            yield f"Camera “{camera.name}” of {path.name} has “{key}”, which is not read; did you mean “sigma”?"
+    if "metadata" not in table and (key := _nearly("metadata", table)):
+        yield f"{path.name} has [{key}], which is not read; did you mean [metadata]?"
+    for where, names in (("", table), (" under [metadata]", table.get("metadata", {}))):
+        key = _nearly("unit", names) or ("unit" if not where and "unit" in names else "")
+        if key and names[key] != table.get("metadata", {}).get("unit"):
+            yield f"{path.name} has “{key}”{where}, which is not read: write unit = {shown(names[key])} under [metadata]."
+
+
+def _nearly(name: str, table: Mapping[str, Any]) -> str:
+    """The key of a table that is nearly this name, which the table lacks; empty if none is."""
+    plain = {re.sub("[_ -]", "", key).lower(): key for key in table if key != name}
+    close = difflib.get_close_matches(name, plain, n=1, cutoff=NEARLY)
+    return plain[close[0]] if close and name not in table else ""
 
 
 def check_cameras(cameras: Sequence[Camera], label: str) -> None:
@@ -158,6 +190,9 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
         raise InputError(f"[{key}] of the rig {path} is not a table.")
     name = entry.get("name", key)
     label = f"Camera “{name}” of the rig {path}"
+    for known in ("distortions", "fisheye", "affinity"):
+        if misspelt := _nearly(known, entry):
+            raise InputError(f"{label} has “{misspelt}”, which would be ignored; write “{known}”.")
     size = _array(entry, "size", (2,), label)
     matrix = _array(entry, "matrix", (3, 3), label)
     distortions = np.zeros(5)

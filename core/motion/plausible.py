@@ -26,13 +26,13 @@ def check_times(frames: np.ndarray, fps: float, what: object) -> None:
         raise InputError(f"{what} with frame {after:g} after frame {last:g}; frame numbers must increase. Sort the file, or correct them.")
 
 
-def check_span(first: float, last: float, count: int, what: object) -> None:
-    """Check that `count` frames, or keys, are not spread over very many frames, in each of which Blender would compute a pose.
+def check_span(first: float, last: float, count: int, what: object, most_per_key: int = MOST_PER_KEY) -> None:
+    """Check that `count` frames, or keys, are not spread over very many frames, in each of which a pose would be computed or written.
 
     Raises:
         InputError: they are.
     """
-    if not last - first <= max(MOST_FRAMES, MOST_PER_KEY * count):
+    if not last - first <= max(MOST_FRAMES, most_per_key * count):
         raise InputError(f"{what} from frame {first:g} to {last:g}, with values for {count} alone; correct the frame numbers or times.")
 
 

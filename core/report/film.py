@@ -4,7 +4,6 @@ It is made from the files of a run (skin/, joints.csv, body.toml), so that it ca
 sigma, as in the report.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,9 @@ from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..motion.formats.ply import read_ply
 from ..motion.tables import JointTable, read_joints
+from ..results.films import FILM, place
 from ..results.folder import Results
+from ..results.own_files import files_of
 from ..take.footage import Footage
 from .close_up import Detail, alike, close_up
 from .drawing import plain, size_of, small_text, text_width
@@ -43,14 +44,14 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
         InputError: there is no fitted body, an image cannot be read, or movies cannot be written here.
         Cancelled: the user asked to stop; no film was written.
     """
-    if not results.path("joints.csv").is_file() or not results.path("skin").is_dir():
+    if not results.path("joints.csv").is_file() or not any(files_of(results.path("skin"), "skin")):
         raise InputError(f"{results.folder} has no fitted body with a skin, and a film needs one; run the fit first.")
     joints, skeleton = read_joints(results.path("joints.csv")), read_body(results.path("body.toml")).skeleton
     bones = [(bone.head_joint, bone.tail_joint) for bone in skeleton.bones]
     details = _details(footage.rig.cameras, joints)
     cameras = [detail.camera for detail in details]
     size = sum(c.size_px[0] for c in cameras), max(c.size_px[1] for c in cameras) + BAR_PX
-    part = results.path("cache", "film.mp4")
+    part = results.path("cache", FILM)
     part.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)  # OpenCV would write through a link, or over another name of a file
     movie = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*CODEC), footage.take.fps, (size[0] // 2 * 2, size[1] // 2 * 2))
@@ -71,8 +72,7 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
         movie.release()
         part.unlink(missing_ok=True)
         raise
-    os.replace(part, results.path("film.mp4"))
-    return results.path("film.mp4")
+    return place(part, results.folder, FILM)
 
 
 def _details(cameras: Sequence[Camera], joints: JointTable) -> list[Detail]:

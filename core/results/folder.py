@@ -4,7 +4,6 @@ A checkpoint contains a digest of everything that it depends on; if that differs
 """
 
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,12 +16,14 @@ from ..foundation.errors import InputError
 from ..foundation.lock import NAME, locked
 from ..images.sequence import IMAGE_ENDINGS
 from . import run_json
+from .films import FILMS
+from .own_files import MADE_IN, files_of, remove_own
 from .run_json import FORMAT, VERSION
 
 RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
-    "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4",
-    "scene.mp4", "body.blend",
+    "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", *FILMS,
+    "body.blend",
 )  # fmt: skip
 
 MADE_BY = {  # what of them the stages write, and others need
@@ -31,7 +32,6 @@ MADE_BY = {  # what of them the stages write, and others need
     "fit": ("joints.csv", "motion.csv", "body.toml", "frames.csv", "skin"),
     "report": ("report/report.html",),
 }
-COUNTED = (".ply", ".npz", ".png")  # files of a folder that a run writes; others, such as a system's thumbnails, do not matter
 
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
 PARENTS = ("cache", FIELDS)  # whose folders are written to
@@ -162,7 +162,7 @@ class Results:
         store.save(self.path("cache", stage, f"{name}.npz"), arrays, {"key": key}, compress=False)
 
     def remove(self, *names: str) -> None:
-        """Remove a result of an earlier run, a file or a folder, if it is there.
+        """Remove results of an earlier run, files or folders, if they are there. In a folder, only files that a run makes are removed.
 
         Raises:
             InputError: it cannot be removed.
@@ -170,10 +170,11 @@ class Results:
         for name in names:
             path = self.path(name)
             try:
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink(missing_ok=True)
+                kind = path.relative_to(self.folder).parts[0]
+                if kind in MADE_IN and (kind == name or path.is_dir()):
+                    remove_own(path, kind)
+                elif path.is_symlink() or path.is_file():
+                    path.unlink()
             except OSError as error:
                 reason = f"Cannot remove {path}: {error.strerror or error}. Close the program that uses it, or choose another folder."
                 raise InputError(reason) from error
@@ -181,7 +182,7 @@ class Results:
     def remove_other_clouds(self, frames: range) -> None:
         """Remove the clouds of all other frames."""
         for path in self.path("clouds").glob("*.ply"):
-            if not path.stem.isdecimal() or int(path.stem) not in frames:
+            if path.stem.isdecimal() and int(path.stem) not in frames:
                 path.unlink()
 
     def read_run(self) -> dict[str, Any]:
@@ -227,8 +228,8 @@ def lost(folder: Path, run: Mapping[str, Any]) -> dict[str, list[str]]:
 
 def _size(path: Path) -> tuple[int, int]:
     """The number of files that a result has, and their bytes."""
-    files = path.iterdir() if path.is_dir() else [path]
-    sizes = [p.stat().st_size for p in files if p.is_file() and (p == path or (p.suffix in COUNTED and not p.name.startswith(".")))]
+    files = files_of(path, path.name) if path.name in MADE_IN else [path]
+    sizes = [p.stat().st_size for p in files if p.is_file()]
     return len(sizes), sum(sizes)
 
 

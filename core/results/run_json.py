@@ -8,9 +8,10 @@ from ..foundation import store
 from ..foundation.errors import InputError
 
 FORMAT, VERSION = "tricap-run", 1
+UNTIL = "until"  # the last stage that a command was to do
 FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
-    "reference_note": str, "files": dict, "blend": list,
+    "reference_note": str, "files": dict, "blend": list, "outlines": dict, "films": dict, UNTIL: str,
 }  # fmt: skip
 STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),
@@ -61,7 +62,11 @@ def _invalid_table(run: Mapping[str, Any]) -> str | None:
     sizes = run.get("files", {}).values()
     if any(not isinstance(size, list) or len(size) != 2 or any(type(n) is not int for n in size) for size in sizes):
         return "files"
-    texts = {"inputs": run.get("inputs", {}).values(), **{name: run.get(name, []) for name in ("warnings", "views", "blend")}}
+    drawn = run.get("outlines", {}).values()
+    if any(not isinstance(entry, dict) or any(not isinstance(text, str) for text in entry.values()) for entry in drawn):
+        return "outlines"
+    texts = {name: run.get(name, {}).values() for name in ("inputs", "films")}
+    texts |= {name: run.get(name, []) for name in ("warnings", "views", "blend")}
     return next((name for name, values in texts.items() if any(not isinstance(v, str) for v in values)), None)
 
 

@@ -27,13 +27,14 @@ from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
 from ..results import blend_file
 from ..results.folder import check_inside, check_separate_folder
-from ..results.outputs import check_output
+from ..results.outputs import check_output, check_replaceable
 from . import pipeline, take_run
 from .engine import Engine, dask_client
 from .settings import Overrides
 
 FORMAT, VERSION = "tricap-batch", 1
 SUMMARY = "batch.json"
+START = f'{{\n "format": "{FORMAT}"'  # of it
 TOPIC = "tricap"  # of the workers' progress reports
 WAIT_S = 0.3  # interval at which the tasks are polled
 REPORT_S = 0.5  # between two progress reports of a worker
@@ -68,10 +69,11 @@ def run_batch(
     place there is reported, and the others run.
 
     Raises:
-        InputError: Dask is not installed, the scheduler cannot be reached, the folder cannot be written to or is a take, or no take has
-            a place in it.
+        InputError: batch.json is not of an earlier batch, Dask is not installed, the scheduler cannot be reached, the folder cannot be
+            written to or is a take, or no take has a place in it.
         Cancelled: finished work is saved; the same command resumes.
     """
+    check_replaceable(Path(folder) / SUMMARY, START)
     outs, refused = out_folders(takes, folder)
     outcomes = {i: Outcome(take=str(takes[i]), out=str(outs[i]), status=Status.INVALID_INPUT, said=said) for i, said in refused.items()}
     _write(folder, engine, takes, outs, outcomes)

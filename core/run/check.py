@@ -10,12 +10,14 @@ from ..foundation.progress import Monitor
 from ..results.run_json import read_run
 from ..take.footage import open_take
 from ..take.take import read_take
+from .drawn_outlines import outlines_in, sentence
 from .file_digests import FileDigests, reads_content
 from .settings import settings_of
 from .stages import STAGES, known_keys, stage_keys
 from .take_run import only_frames
 
 COMPARED = "compare.json"  # beside the halves of a comparison
+NEW_OUTLINE = "The next run does not use it; draw a new one with `tricap contour`."
 READ_BY = {"measure": "Images, masks or time stamps", "track": "Corrections", "fit": "Keypoints, outlines or body model"}
 
 
@@ -51,10 +53,12 @@ def _other_files(folder: Path) -> list[Finding]:
         footage = only_frames(open_take(read_take(place), click_sigma_px=settings["fitting"].click_sigma_px), tuple(run["frames"]))
         keys = stage_keys(footage, settings, folder)
         keys = known_keys(keys, run, lambda: stage_keys(footage, settings, folder, FileDigests().stamp) if reads_content(footage) else {})
+        outlines = outlines_in(folder, run, footage, FileDigests())
     except InputError as error:
         return [wrong(Cause.STALE_RESULT, f"{place} cannot be read as it was for this run: {error}")]
+    found = [wrong(Cause.STALE_RESULT, f"{sentence(folder, view)}.", NEW_OUTLINE) for view in outlines.outdated]
     for stage in STAGES:
         if run["stages"].get(stage, {}).get("key", keys[stage]) != keys[stage]:
-            sentence = f"{READ_BY[stage]} of {place} were replaced since this run, or this version computes otherwise."
-            return [wrong(Cause.STALE_RESULT, sentence, again)]
-    return []
+            replaced = f"{READ_BY[stage]} of {place} were replaced since this run, or this version computes otherwise."
+            return [wrong(Cause.STALE_RESULT, replaced, again), *found]
+    return found

@@ -24,6 +24,7 @@ from ..geometry.view_angles import views_alike
 from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page, written
 from ..results.folder import Results, check_inside, check_separate_folder
+from ..results.outputs import check_replaceable
 from ..take.take import Clicks, FrameClicks, Take
 from . import pipeline
 from .joints import pixels_of, with_joints
@@ -34,6 +35,8 @@ PLACE_M = 0.02  # edge of the cubes in which coverage is counted
 SURFACE, TRACKS, BODY, TIME = "Surface", "Trajectories", "Body", "Time"  # groups of measures
 CLICKED_POINTS = 6  # of the surface, where nobody clicked any: a person clicks few
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
+FORMAT, TABLE, PAGE = "tricap-comparison", "compare.json", "compare.html"
+START = f'{{\n "format": "{FORMAT}"'  # of the table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +58,7 @@ def run_both(
         Cancelled: what is done is kept.
     """
     check_separate_folder(out)
+    _check_replaceable(out)
     for method in METHODS:
         check_inside(real_path(out) / method, real_path(out))
     if "preset" in overrides.get("method", {}):
@@ -159,12 +163,23 @@ def measures_of(halves: Halves, monitor: Monitor) -> list[Measure]:
     return [*_of_clouds(halves.folders, monitor), *_of_runs([runs.get(method, {"stages": {}}) for method in METHODS])]
 
 
+def _check_replaceable(out: Path) -> None:
+    """Check that compare.json and compare.html, if they are there, are of an earlier comparison.
+
+    Raises:
+        InputError: they are not.
+    """
+    check_replaceable(out / TABLE, START)
+    if not (out / TABLE).exists():
+        check_replaceable(out / PAGE)
+
+
 def write_comparison(out: Path, take: Path, halves: Halves, measures: Sequence[Measure]) -> None:
     """Write DIR/compare.json and DIR/compare.html."""
     rows = [as_row(measure) for measure in measures]
-    table = {"format": "tricap-comparison", "version": 1, "take": str(take), "notes": halves.notes, "measures": rows}
-    store.write_json(out / "compare.json", table)
-    store.write_text(out / "compare.html", comparison_page(real_path(take).name, measures, halves.folders, halves.notes))
+    table = {"format": FORMAT, "version": 1, "take": str(take), "notes": halves.notes, "measures": rows}
+    store.write_json(out / TABLE, table)
+    store.write_text(out / PAGE, comparison_page(real_path(take).name, measures, halves.folders, halves.notes))
 
 
 def as_row(measure: Measure) -> dict[str, Any]:

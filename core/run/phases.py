@@ -23,8 +23,13 @@ COST: dict[str, dict[str, tuple[float, float]]] = {
     },
     "report": {"report": (2.5, 0.01)},
 }
+WITHOUT_SURFACE = "fit without a surface"
+_OUTLINES = {"background": COST["fit"]["background"], "follow points": (6.0, 0.9)}
+COST[WITHOUT_SURFACE] = _OUTLINES | {name: cost for name, cost in COST["fit"].items() if name not in (*_OUTLINES, "coarse surface")}
 
 
-def course_of(stages: Sequence[str], frames: int) -> Course:
-    """The progress of some stages of a run over so many frames."""
+def course_of(stages: Sequence[str], frames: int, *, surface: bool = True) -> Course:
+    """The progress of some stages of a run over so many frames; without a `surface` there is nothing to measure and to track."""
+    if not surface:
+        stages = [WITHOUT_SURFACE if stage == "fit" else stage for stage in stages if stage not in ("measure", "track")]
     return Course([(name, once + frames * each) for stage in stages for name, (once, each) in COST[stage].items()])

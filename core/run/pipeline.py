@@ -27,13 +27,13 @@ from ..checking.rig_check import wide_findings
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
-from ..fitting.inputs.background import BackgroundDistances
 from ..fitting.inputs.completed_clouds import clouds_for_fit
 from ..fitting.inputs.fit_input import FitInput
-from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
+from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons, points_in_views
 from ..fitting.inputs.start_joints import NeedsClick
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
+from ..fitting.stages.rough_motion import rough_bodies
 from ..fitting.stages.sequence import fit_and_start, fit_from
 from ..fitting.stages.set_up import NobodyFound, of_model, with_start
 from ..foundation import store
@@ -47,6 +47,7 @@ from ..report.pages import Report, write_report
 from ..report.person import skin_in
 from ..report.silhouettes import by_view, silhouettes_of
 from ..results.folder import FitCheckpoints
+from ..results.run_json import UNTIL
 from ..surface.beginning import other_beginning
 from ..surface.cloud import as_written, write_cloud
 from ..surface.frames import FrameSummary, MeasuredFrames, summary_of
@@ -82,9 +83,8 @@ def measure(run: Run, monitor: Monitor) -> None:
         InputError: the footage cannot be read, or nothing can be measured.
         Cancelled: the frames measured so far are kept.
     """
-    cameras, reference = run.footage.rig.cameras, run.footage.take.reference
-    if no_view_alike(cameras, reference) and not missing_for_fit(run.footage):
-        run.warn(*(finding.sentence for finding in wide_findings(cameras, reference)))
+    if _does_without_surface(run):
+        run.warn(*(finding.sentence for finding in wide_findings(run.footage.rig.cameras, run.footage.take.reference)))
         return run.do_without_surface("the views look from too far apart")
     began, summaries, kept, frames = time.perf_counter(), list[FrameSummary](), set[int](), run.footage.frames
     run.results.remove_other_clouds(frames)
@@ -215,13 +215,21 @@ def run(
 
 def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
-    check_body(run.footage, run.settings["fitting"])
-    stages = (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report)
-    monitor.course = course_of([stage.__name__ for stage in stages], len(run.footage.frames))
-    for stage in stages:
-        monitor.begin(stage.__name__)
-        stage(run, monitor)
+    do_stages(run, ("measure", "track", "fit", "report") if run.settings["fitting"].use_surface else ("fit", "report"), monitor)
     monitor.course = None
+
+
+def do_stages(run: Run, names: Sequence[str], monitor: Monitor) -> None:
+    """Some stages of an opened take, one after the other, with one progress for all of them."""
+    if "fit" in names:
+        check_body(run.footage, run.settings["fitting"])
+    run.record[UNTIL] = names[-1]
+    surface = run.settings["fitting"].use_surface and not _does_without_surface(run)
+    monitor.course = course_of(names, len(run.footage.frames), surface=surface)
+    stages = {"measure": measure, "track": track, "fit": fit, "report": report}
+    for name in names:
+        monitor.begin(name)
+        stages[name](run, monitor)
 
 
 def is_complete(run: Run) -> bool:
@@ -234,6 +242,11 @@ def is_complete(run: Run) -> bool:
 
 
 # ---- the steps of the stages ---------------------------------------------------------------------------------------------
+
+
+def _does_without_surface(run: Run) -> bool:
+    """Whether a body is wanted, and all views look from too far apart for a surface."""
+    return no_view_alike(run.footage.rig.cameras, run.footage.take.reference) and not missing_for_fit(run.footage)
 
 
 def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], kept: set[int], monitor: Monitor) -> Foreground | None:
@@ -320,21 +333,32 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
     clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
     given = fit_input(run.footage, clouds, run.trajectories, run.results, background)
+    if run.trajectories is None and fitting.use_trajectories:
+        given = _with_image_tracks(run, given, monitor)
     if (fitted := read_fitted(run.results, run.body_key)) is not None:
         given, body, tracked_again = replace(of_model(given, fitted.model), start=fitted.start), fitted.body, dict[str, Any]()
     else:
-        given, body, tracked_again = _fit_to(run, given, background, monitor)
+        given, body, tracked_again = _fit_to(run, given, monitor)
     run.body = body = _write_body(run, body, monitor)
     run.results.remove(*FIT_STEPS)
     outlines = {**outline_polygons(run.footage, run.results, FOLDER), **outline_polygons(run.footage, run.results)}
     skin_at = skin_in(run.results.path("skin"), body, run.settings["skin"])
-    run.silhouettes = silhouettes_of(run.footage, body, skin_at, outlines, background, monitor)
+    run.silhouettes = silhouettes_of(run.footage, body, skin_at, outlines, given.background, monitor)
     return given, body, tracked_again
 
 
-def _fit_to(
-    run: Run, given: FitInput, background: Sequence[BackgroundDistances], monitor: Monitor
-) -> tuple[FitInput, BodyFit, dict[str, Any]]:
+def _with_image_tracks(run: Run, given: FitInput, monitor: Monitor) -> FitInput:
+    """The input with points that are followed in single views, and with the background as it is then known (`rough_motion`)."""
+    fitting, parts = run.settings["fitting"], [monitor.part("follow points", i, 4) for i in range(4)]
+    given = replace(given, image_tracks=points_in_views(run.footage, given.background, parts[0]))
+    if not given.image_tracks or not any(region.estimated for region in given.background):
+        return given
+    bodies = rough_bodies(given, fitting, parts[1], FitCheckpoints(run.results, run.body_key, "fit_rough"))
+    background = background_regions(run.footage, run.results, run.clouds, fitting, parts[2], bodies=bodies)
+    return replace(given, background=background, image_tracks=points_in_views(run.footage, background, parts[3], bodies))
+
+
+def _fit_to(run: Run, given: FitInput, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, Any]]:
     """Fit the body, and track once more with its help; a body whose trajectories stay has a checkpoint."""
     fitting = run.settings["fitting"]
     given = with_start(given, fitting, monitor)
@@ -345,7 +369,7 @@ def _fit_to(
         return given, body, {}
     tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage))
     if loop != OFF:
-        clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, background, fitting, run.results, monitor)
+        clouds = clouds_for_fit(run.footage, run.clouds, run.trajectories, given.background, fitting, run.results, monitor)
         contours = predicted_outlines(run, body, monitor) if loop == OUTLINES else given.contours
         given = replace(given, clouds=clouds, trajectories=run.trajectories, contours=contours)
         body = fit_from(given, start, fitting, monitor, FitCheckpoints(run.results, run.body_key, "fit_again"))

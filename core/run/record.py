@@ -22,6 +22,7 @@ from ..geometry.robust import finite_median
 from ..matching.foreground import Foreground
 from ..surface.frames import FrameSummary
 from ..take.footage import Footage
+from ..tracking.corrections import odd_regions
 from ..tracking.settings import TrackStatus
 from ..tracking.trajectories import Trajectories
 from .stages import command_of
@@ -44,7 +45,7 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
         "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
         "repeat": command_of(footage, settings),
         "stages": {},
-        "warnings": [],
+        "warnings": [*footage.rig.remarks, *odd_regions(take.corrections, footage.rig)],
     }
 
 

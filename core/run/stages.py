@@ -18,10 +18,12 @@ from ..fitting.settings import ALGORITHM
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
+from ..results.films import FILMS
 from ..surface import starts
 from ..take.footage import Footage
 from ..take.take import NO_BODY, FrameClicks, Take, View
 from ..tracking import track
+from .file_digests import reads_content
 
 STAGES = ("measure", "track", "fit")
 
@@ -89,7 +91,7 @@ STAGE_INPUTS: dict[str, StageInput] = {
     "fit": StageInput(
         settings=("fitting", "skin"),
         take=_fit_input,
-        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", "film.mp4", "scene.mp4", "body.blend"),
+        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "outlines", "report", *FILMS, "body.blend"),
     ),
 }
 # Groups in no stage's key: a preset enters by its settings, the outlines of `tricap contour` by their content, chosen points do not.
@@ -98,20 +100,33 @@ STAGE_FILES = tuple(name for own in STAGE_INPUTS.values() for name in own.files)
 
 
 def time_stamp(path: Path) -> tuple[str, int, int]:
-    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
+    """Name, size, and modification time in nanoseconds."""
     state = path.stat()
-    return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
+    return path.name, state.st_size, state.st_mtime_ns
 
 
-def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp = time_stamp) -> dict[str, str]:
+def coarse_time_stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
+    name, size, time_ns = time_stamp(path)
+    return name, size, time_ns // 1_000_000_000
+
+
+def stamp_for(footage: Footage) -> Stamp:
+    """What stands for a file of a take: where other times alone do not matter, because its content is read, times are exact. Otherwise a
+    copy to another file system would be another take."""
+    return time_stamp if reads_content(footage) else coarse_time_stamp
+
+
+def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp | None = None) -> dict[str, str]:
     """The key of every stage, for opened footage, the settings of a run, and the contours in its folder OUT, whose digest is the
-    second word of the fit's key. `stamp`: what stands for a file.
+    second word of the fit's key. `stamp`: what stands for a file, by default its time.
 
     Raises:
         InputError: footage, rig or model are missing.
     """
     keys, before = {}, ""
     try:
+        stamp = stamp or stamp_for(footage)
         for stage, own in STAGE_INPUTS.items():
             inputs = [settings[name] for name in own.settings], own.take(footage, stamp)
             before = keys[stage] = store.digest(before, repr(inputs))

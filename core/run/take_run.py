@@ -17,8 +17,9 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
-from ..results import blend_file
+from ..results import blend_file, films
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
+from ..results.own_files import files_of
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
 from ..surface.resolution import measured_footage
@@ -27,6 +28,7 @@ from ..take.footage import Footage, open_take
 from ..take.take import Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import Trajectories
+from . import drawn_outlines
 from .engine import Engine
 from .file_digests import FileDigests, reads_content
 from .record import frame_table, new_record, write_frame_table
@@ -36,7 +38,7 @@ from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_k
 SURFACE = "surface"  # of the measured stage in run.json: the digest of the keys of its frames, with the content of their images
 OTHER_IMAGES = "The images are not those that were measured before; tracks and body of these were removed."
 REPLACED = "Images or other files of the take were replaced or removed during this run, so its results do not fit each other. Run it again."
-FIT_STEPS = ("cache/fit", "cache/fit_again")  # checkpoints of a fit under way
+FIT_STEPS = ("cache/fit_rough", "cache/fit", "cache/fit_again")  # checkpoints of a fit under way
 FITTED = "cache/body"
 
 
@@ -54,6 +56,7 @@ class Run:
     digests: FileDigests = field(default_factory=FileDigests)
     record: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # what the user should know of the folder, and not of its results
+    keeps_body: bool = False  # the files of an earlier fit stay until the next one, also where they are out of date
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
@@ -108,8 +111,9 @@ class Run:
         of images nor parts of a second of their times."""
         if self.record["stages"].get("measure", {}).get(SURFACE, digest) == digest:
             return
-        after = STAGES[STAGES.index("measure") + 1 :]
-        self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in (*after, "report")}
+        after = ("track",) if self.keeps_body else STAGES[STAGES.index("measure") + 1 :]
+        dropped = after if self.keeps_body else (*after, "report")
+        self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in dropped}
         names = [name for stage in after for name in STAGE_INPUTS[stage].files]
         self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *FIT_STEPS, FITTED])]
 
@@ -150,15 +154,17 @@ def open_run(
     frames: tuple[int, int] | None = None,
     *,
     restart: bool = False,
-    ignore_contours: bool = False,
+    for_contours: bool = False,
+    needs_body: bool = False,
     pictures: Sequence[int] = (),
     clicked: Callable[[Take], Take] | None = None,
 ) -> Iterator[Run]:
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
-    What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
-    A body.blend that somebody edited gets another name; `notes` has the sentence that says so, and so has an error that follows.
-    `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
+    What an earlier run of other input left in OUT is removed (with `for_contours` surface and tracks alone: the files of a fit stay until
+    the next one); `restart` removes it all. A body.blend that somebody edited, and an outline that was drawn on other images, get another
+    name; `notes` has the sentences that say so, and so has an error that follows. `needs_body`: a body of the same input must be there, but
+    for its outlines. `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -168,29 +174,67 @@ def open_run(
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
     footage = _checked_footage(take, settings, out, frames)
     check_pictured(footage.frames, pictures)
-    keys, body_key = stage_keys(footage, settings, Path(out)), stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
-    begun, opened = dict(settings), keys["measure"]
+    begun, opened = dict(settings), stage_keys(footage, settings, Path(out))["measure"]
     with Results(out).opened() as results:
-        notes = _remove_all(results) if restart else []
         before, digests = {} if restart else results.read_run(), FileDigests()
 
         def by_content() -> dict[str, str]:
             return stage_keys(footage, settings, Path(out), digests.stamp) if reads_content(footage) else {}
 
-        keys = _known(results, before, keys, by_content)
-        record = new_record(footage, settings)
-        kept, incomplete = valid_stages(before, keys, ignore_contours=ignore_contours), lost(results.folder, before)
-        record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
-        record |= {name: before[name] for name in (blend_file.DIGESTS,) if name in before}
-        if before:  # what was made otherwise must not stand beside the new
-            notes += _remove(results, [name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files])
-        run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
-        run.replaced = partial(_are_others, footage, begun, Path(out), opened)
-        run.notes, run.digests = notes, digests
-        with _with_errors(run.notes):
+        outlines, notes = _outlines(results, before, footage, digests, check=not for_contours)
+        with _with_errors(notes):
+            keys = _known(results, before, stage_keys(footage, settings, Path(out)), by_content)
+            kept = _kept_stages(results, before, keys, for_contours=for_contours, needs_body=needs_body)
+            record, incomplete = new_record(footage, settings) | {drawn_outlines.ENTRY: outlines}, lost(results.folder, before)
+            record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
+            record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
+            notes += _remove_all(results) if restart else _remove_stale(results, before, kept)
+            body_key = stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
+            run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
+            run.replaced = partial(_are_others, footage, begun, Path(out), opened)
+            run.notes, run.digests, run.keeps_body = notes, digests, for_contours
             if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
                 run.content_keys = by_content()
             yield run
+
+
+def _kept_stages(
+    results: Results, before: Mapping[str, Any], keys: Mapping[str, str], *, for_contours: bool, needs_body: bool
+) -> dict[str, Any]:
+    """The stages of an earlier run whose files stay: those of the same input, and for contours also a fit that is out of date.
+
+    Raises:
+        InputError: a body of the same input is needed, and there is none.
+    """
+    valid = valid_stages(before, keys, ignore_contours=for_contours)
+    if needs_body and ("fit" not in valid or not any(files_of(results.path("skin"), "skin"))):
+        raise InputError(f"{results.folder} has no fitted body with a skin for these frames and settings; run `tricap fit` first.")
+    earlier = before.get("stages", {}) if for_contours else {}
+    return {name: earlier[name] for name in ("fit", "report") if name in earlier} | valid
+
+
+def _outlines(
+    results: Results, before: dict[str, Any], footage: Footage, digests: FileDigests, *, check: bool
+) -> tuple[dict[str, drawn_outlines.Drawn], list[str]]:
+    """What run.json is to note of the outlines in the folder; one that was drawn on other images is set aside, and sentences say so.
+    `check`: that the others can be read. Outlines stay where a run begins anew."""
+    before = before or _recorded(results)
+    found = drawn_outlines.outlines_in(results.folder, before, footage, digests)
+    if check:
+        drawn_outlines.check_tables(results.folder, [*found.current])
+    notes = [drawn_outlines.set_aside(results.folder, view) for view in found.outdated]
+    if before and before.get(drawn_outlines.ENTRY, {}) != found.current:
+        before[drawn_outlines.ENTRY] = found.current
+        store.write_json(results.path("run.json"), before)
+    return found.current, notes
+
+
+def _recorded(results: Results) -> dict[str, Any]:
+    """run.json as it is; empty where it is missing or damaged, which a run that begins anew replaces."""
+    try:
+        return results.read_run()
+    except InputError:
+        return {}
 
 
 def _checked_footage(take: Take, settings: Mapping[str, Any], out: Path, frames: tuple[int, int] | None) -> Footage:
@@ -230,8 +274,18 @@ def _remove_all(results: Results) -> list[str]:
     return _remove(results, [blend_file.BLEND, "run.json", "clouds", *STAGE_FILES, "cache"])
 
 
+def _remove_stale(results: Results, before: Mapping[str, Any], kept: Mapping[str, Any]) -> list[str]:
+    """Remove the results of stages that are not kept: what was made otherwise must not stand beside the new. See `_remove`."""
+    return _remove(results, [name for stage, own in STAGE_INPUTS.items() if before and stage not in kept for name in own.files])
+
+
 def _remove(results: Results, names: Sequence[str]) -> list[str]:
-    """Remove results. A body.blend with edits gets another name instead; the sentence that says so."""
+    """Remove results. A body.blend with edits gets another name instead; the sentence that says so.
+
+    Raises:
+        InputError: a film may be the user's; then nothing is removed. Or something cannot be removed.
+    """
+    films.check_ours(results.folder, _recorded(results), {*names}.intersection(films.FILMS))
     kept = blend_file.keep_edited(results.folder) if blend_file.BLEND in names else ""
     results.remove(*names)
     return [kept] if kept else []

@@ -12,7 +12,8 @@ all at the instants of the field that take.toml selects; the other field is expo
 
 import io
 import json
-import shutil
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,11 +27,13 @@ from ..body.skeleton import joint_positions
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..foundation.settings import knob, to_table
+from ..foundation.settings import from_table, knob, to_table
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
 from ..images.interlace import BOTH, INTERLACE, field_layout, frame_time_s
+from ..images.sequence import IMAGE_ENDINGS
+from ..take.writing import copy_aside, has_comments
 from .figure import Part, arm_parts, joined, torso_parts, wall
 from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, solid_noise, visible_vertices
 from .person import person
@@ -45,6 +48,7 @@ VISIBLE_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[
 TARGET_M = np.array([-0.34, -0.06, 1.35])  # where the cameras look
 WALL_Y_M = 1.20
 SWING_S = 1.36  # there and back
+IMAGE = r"\d{4,}\.(png|jpg)"  # name of one of the recording
 VIEWS, LATE = ("L", "C", "R"), "R"
 JOINTS = ("shoulder.R", "elbow.R", "wrist.R")
 MARK = "synthetic arm"  # in rig.toml's metadata
@@ -97,7 +101,7 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     for frame in range(settings.frames):
         visible.append(_film_frame(folder, studio, frame, monitor))
     store.write_bytes(folder / "truth.npz", _truth(studio, np.concatenate(visible)))
-    store.write_text(folder / "take.toml", _take_toml(studio))
+    store.write_text(folder / "take.toml", _take_toml(settings, studio.subject, studio.rig))
     monitor.step(STAGE, 1, 1)
 
 
@@ -115,10 +119,14 @@ def _made_here(folder: Path) -> bool:
 
 
 def _studio(settings: ArmTakeSettings) -> _Studio:
-    subject = person(settings.swing_s) if settings.subject == PERSON else arm(settings.swing_s)
-    rig, noise = rig_for(subject, settings.width_px), solid_noise(settings.seed).scaled(settings.texture)
+    (subject, rig), noise = _subject_and_rig(settings), solid_noise(settings.seed).scaled(settings.texture)
     backdrops = tuple(paint(camera, [subject.backdrop], noise) for camera in rig.cameras)
     return _Studio(settings=settings, rig=rig, subject=subject, noise=noise, backdrops=backdrops)
+
+
+def _subject_and_rig(settings: ArmTakeSettings) -> tuple[Subject, Rig]:
+    subject = person(settings.swing_s) if settings.subject == PERSON else arm(settings.swing_s)
+    return subject, rig_for(subject, settings.width_px)
 
 
 def arm(swing_s: float) -> Subject:
@@ -213,17 +221,48 @@ def _rig(width_px: int, target_m: np.ndarray, size: float) -> Rig:
 
 
 def clear_recording(folder: Path) -> None:
-    """Clear the folder for a new recording. Only a synthetic recording is removed; rig.toml, which marks it, stays until it is replaced."""
+    """Clear the folder for a new recording. Only a synthetic recording is removed; rig.toml, which marks it, stays until it is replaced. A
+    take.toml with changes is copied to take.toml.bak before.
+
+    Raises:
+        InputError: the folder has other content, or images among those of the recording; then nothing is removed.
+    """
     try:
         if folder.exists() and not _made_here(folder) and any(folder.iterdir()):
             raise InputError(f"{folder} is not empty and holds no sample recording; choose a new folder for it.")
-        for name in ("take.toml", "truth.npz"):
-            (folder / name).unlink(missing_ok=True)
-        for view in VIEWS:
-            if (folder / view).exists():
-                shutil.rmtree(folder / view)
+        made, frames = [path for view in VIEWS for path in _images(folder / view)], _frames_of(folder)
+        if others := [path for path in made if not (re.fullmatch(IMAGE, path.name) and int(path.stem) < frames)]:
+            raise InputError(f"{others[0]} is not of the recording in {folder}, and would become part of it; move it elsewhere.")
+        _keep_changes(folder)
+        for path in (*made, folder / "take.toml", folder / "truth.npz"):
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"Cannot make room for a recording in {folder}: {error.strerror or error}; choose another folder.") from error
+
+
+def _images(folder: Path) -> list[Path]:
+    """All files of a folder of images that a take would read."""
+    return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_ENDINGS] if folder.is_dir() else []
+
+
+def _frames_of(folder: Path) -> float:
+    """The number of images in each view of a complete recording; of another one nobody knows it."""
+    try:
+        return int(bounded.json_of(read_truth(folder).settings)["frames"])
+    except (InputError, ValueError, KeyError, TypeError):
+        return math.inf
+
+
+def _keep_changes(folder: Path) -> None:
+    """Copy a take.toml that is not as this function's recording has it."""
+    try:
+        settings = from_table(ArmTakeSettings, bounded.json_of(read_truth(folder).settings), "truth.npz")
+        written = _take_toml(settings, *_subject_and_rig(settings))
+        changed = written.splitlines() != bounded.text_of(folder / "take.toml", bounded.TOML_BYTES).replace(".jpg", ".png").splitlines()
+    except (InputError, OSError, ValueError):
+        changed = has_comments(folder)
+    if changed and (folder / "take.toml").is_file():
+        copy_aside(folder / "take.toml")
 
 
 def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
@@ -279,8 +318,7 @@ def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _take_toml(studio: _Studio) -> str:
-    settings, rig, subject = studio.settings, studio.rig, studio.subject
+def _take_toml(settings: ArmTakeSettings, subject: Subject, rig: Rig) -> str:
     rng = np.random.default_rng([settings.seed, 77])
     joints = joint_positions(subject.shape.skeleton, subject.shape.lengths_m, subject.motion(0.0))
     lines = [

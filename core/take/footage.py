@@ -191,7 +191,7 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
         InputError: a view without camera or images, views of unequal length, frames or clicks outside the footage.
     """
     rig = read_rig(take.rig_path)
-    rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata)
+    rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata, remarks=rig.remarks)
     take = take if take.reference_chosen else replace(take, reference_view=default_reference([v.name for v in take.views], rig))
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     frames, clocks = footage_frames(take, sequences), clocks_of(take, sequences)
@@ -199,6 +199,7 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
         sequences = tuple(s if isinstance(s, Recent) else Recent(s) for s in sequences)  # read with their neighbours in time
     footage = Footage(take=take, rig=rig, sequences=sequences, frames=frames, clocks=clocks, click_sigma_px=click_sigma_px)
     _check_clicks(footage)
+    _check_corrections(footage)
     return footage
 
 
@@ -247,6 +248,16 @@ def _common_frames(take: Take, per: int, clocks: tuple[Clock, ...], counts: list
         has = f"the views have frames {per * first} to {per * stop} (half-open) in common"
         raise InputError(f"`frames` of {take.folder.name} is [{take.frames[0]}, {take.frames[1]}], but {has}; correct it in take.toml.")
     return range(*take.frames)
+
+
+def _check_corrections(footage: Footage) -> None:
+    for c in footage.take.corrections:
+        if c.frames.stop <= footage.frames.start or c.frames.start >= footage.frames.stop:
+            where = f"frames {c.frames.start} to {c.frames.stop - 1}" if len(c.frames) > 1 else f"frame {c.frames.start}"
+            raise InputError(
+                f"A correction of {footage.take.folder.name} in view {c.view} is for {where}, and the take has the frames "
+                f"{footage.frames.start} to {footage.frames.stop - 1}; correct it under [[corrections]], or remove it."
+            )
 
 
 def _check_clicks(footage: Footage) -> None:

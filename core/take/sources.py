@@ -182,4 +182,6 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
     if not isinstance(offset, int) or not fits or not isinstance(axes, str | None):
         needs = f"a whole `offset_frames`, a positive `sigma` ({LEAST_SIGMA:g} to {LARGEST_SIGMA:g}) and a name as `axes`"
         raise InputError(f"The {where} with “{files}” needs {needs}.")
+    if view and axes is not None:
+        raise InputError(f"`axes` of the {where} with “{files}” is for files in space, and these are of pixels; remove it.")
     return KeypointSource(files=files, view=view, offset_frames=offset, sigma=float(sigma), names=names, axes=axes)

@@ -73,7 +73,7 @@ def write_table(folder: Path, table: Table) -> bool:
     if path.is_symlink():
         raise InputError(f"{path} is a link, which a file would replace; put a copy in its place, or change the take that it leads to.")
     if has_comments(folder):
-        _copy(path)
+        copy_aside(path)
     store.write_text(path, toml_text(table))
     return True
 
@@ -86,7 +86,7 @@ def has_comments(folder: Path) -> bool:
         return False
 
 
-def _copy(path: Path) -> None:
+def copy_aside(path: Path) -> None:
     """Copy a file to NAME.bak, or to NAME.2.bak, … where that is another file."""
     content = bounded.bytes_of(path, bounded.TOML_BYTES)
     for number in range(1, MOST_COPIES + 1):

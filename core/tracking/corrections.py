@@ -7,6 +7,7 @@ measuring and tracking, whose checkpoints stay valid: neither adding nor removin
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from ..foundation.progress import Monitor
@@ -17,6 +18,7 @@ from ..take.take import Correction
 from .settings import TrackingSettings, TrackStatus
 from .trajectories import Filtered, Trajectories, filter_trajectories, picked
 
+SMALLEST_PX2 = 1.0  # of the image in a region
 CLICK_REACH_PX = 5.0  # distance from a click to the trajectory that it means
 
 
@@ -89,6 +91,21 @@ def corrected_tracks(
             if source is not None:
                 filtered, hit[number] = without(filtered, source), source
     return filtered, hit
+
+
+def odd_regions(corrections: Sequence[Correction], rig: Rig) -> list[str]:
+    """A sentence for each region that has nothing of its view's image in it."""
+    odd = [c for c in corrections if c.kind == "region" and _enclosed_px2(c.xy_px, rig[c.view]) < SMALLEST_PX2]
+    where = [f"({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view}" for c in odd]
+    return [f"The corrected region at {place} encloses nothing of the image; draw it again or remove it." for place in where]
+
+
+def _enclosed_px2(polygon: np.ndarray, camera: Camera) -> float:
+    """The area of the image within the convex hull of a polygon (V, 2)."""
+    w, h = camera.size_px
+    image = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32)
+    hull = cv2.convexHull(polygon.astype(np.float32))[:, 0]
+    return float(cv2.intersectConvexConvex(hull, image)[0]) if len(hull) > 2 else 0.0
 
 
 def missed_clicks(corrections: Sequence[Correction], hit: Collection[int]) -> list[str]:

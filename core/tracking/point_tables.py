@@ -6,17 +6,23 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
+from ..geometry.camera import Camera
 from ..images.interlace import frame_time_s
 from .key_points import KeyPoints
 from .planar import PlanarTracks
 from .settings import TrackStatus
 
+MOST_CORNERS = 1000  # of a polygon, as in take.toml
+FARTHEST_PX = 1e6  # of a corner, as in take.toml
+SMALLEST_PX2 = 1.0  # area of a polygon
+MOST_VERTICES = 4000  # of the outline that starts from a polygon: its fit needs memory by their square
 MAX_COMPARED = 1000  # names among which the nearest to a misspelt one is searched
 
 
@@ -72,6 +78,7 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     return value
 
 
+PLANAR_HEAD = "frame,point,x,y,sigma,correlation,status"
 SPACE_HEAD, IMAGES_HEAD = "frame,time_s,point,x,y,z,sigma,status", "frame,view,point,x,y"
 
 
@@ -81,7 +88,7 @@ def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> No
     Raises:
         InputError: the file cannot be written.
     """
-    lines = ["frame,point,x,y,sigma,correlation,status"]
+    lines = [PLANAR_HEAD]
     for t, frame in enumerate(tracks.frames):
         for n, name in enumerate(names):
             numbers = (*tracks.xy_px[t, n], tracks.sigma_px[t, n], tracks.correlation[t, n])
@@ -191,7 +198,7 @@ def read_polygon(path: Path) -> np.ndarray:
     """Vertices (V, 2) of a CSV with the columns x, y.
 
     Raises:
-        InputError: the file cannot be read, or has fewer than three vertices.
+        InputError: the file cannot be read, has fewer than three different vertices or very many, or encloses nothing.
     """
     try:
         rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
@@ -199,4 +206,39 @@ def read_polygon(path: Path) -> np.ndarray:
         raise InputError(f"Cannot read the polygon {path}: {error}.") from error
     if len(rows) < 3 or not {"x", "y"} <= set(rows[0]):
         raise InputError(f"{path} is not a polygon; write a line x,y and three or more lines of pixel coordinates.")
-    return np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
+    if len(rows) > MOST_CORNERS:
+        raise InputError(f"{path} has {len(rows)} corners; {MOST_CORNERS} is the most. `tricap contour` finds the outline between them.")
+    xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
+    if (np.abs(xy) > FARTHEST_PX).any():
+        raise InputError(f"{path} has corners beyond {FARTHEST_PX:g} pixels; write pixels of the image.")
+    if len(np.unique(xy, axis=0)) < 3 or _enclosed(xy) < SMALLEST_PX2:
+        raise InputError(f"{path} encloses less than a pixel; write three or more corners around the person.")
+    return xy
+
+
+def check_polygon(polygon_px: np.ndarray, camera: Camera, spacing_px: float, path: Path) -> None:
+    """Check that a polygon (V, 2) from a file can be the outline of a person in the image of a camera.
+
+    Raises:
+        InputError: it lies outside of the image, reaches far beyond it, or is too long for vertices at this spacing.
+    """
+    size = np.array(camera.size_px)
+    if not camera.sees(polygon_px).any():
+        raise InputError(f"The polygon {path} lies outside the image of view {camera.name}; write its pixels in the first frame.")
+    if (polygon_px < -size).any() or (polygon_px > 2 * size).any():
+        raise InputError(
+            f"The polygon {path} reaches further beyond the image of view {camera.name} than that is large "
+            f"({size[0]}×{size[1]} px); correct it."
+        )
+    length = float(np.linalg.norm(polygon_px - np.roll(polygon_px, 1, axis=0), axis=1).sum())
+    if length > MOST_VERTICES * spacing_px:
+        raise InputError(
+            f"The polygon {path} is {length:.0f} px long, and {MOST_VERTICES * spacing_px:.0f} px is the most at contour.spacing_px = "
+            f"{spacing_px:g}; draw it once around the person, or with a larger spacing."
+        )
+
+
+def _enclosed(polygon_px: np.ndarray) -> float:
+    """The area (px²) of the convex hull of a polygon (V, 2)."""
+    hull = cv2.convexHull(polygon_px.astype(np.float32))
+    return float(cv2.contourArea(hull))

@@ -375,6 +375,9 @@ def test_a_run_of_one_frame_moves_the_clavicle(empty: ModuleType, full_run: Path
     stranger.unlink()
     assert main(command) == 0
     assert main(command) == 0  # its own report is replaced
+    for name, content in (("out.png", b"repainted"), ("out.json", b'{"name": "my mapping"}')):
+        (tmp_path / name).write_bytes(content)
+        assert main(command) == 2 and (tmp_path / name).read_bytes() == content
     empty.ops.wm.open_mainfile(filepath=str(out))
     target = empty.data.objects["Target"]
     assert abs(np.degrees(angle_of(np.array(target.pose.bones["clavicle.R"].matrix_basis)[:3, :3])) - 30.0) < PLAYED_DEG

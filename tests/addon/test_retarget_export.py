@@ -10,6 +10,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from tricap.addon.command import main
 from tricap.addon.retarget.export import export_file
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -164,6 +165,21 @@ def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_ru
     with pytest.raises(InputError, match="Cannot write"):
         export_file(small_run.out, "glb", wave_file / "a.glb", "plain", Monitor())
     assert not list(tmp_path.glob(".*part*"))
+
+
+@pytest.mark.parametrize("more, said", [
+    (["--format", "trc", "--unit", "mm"], "--unit is that of a BVH, TRC, C3D or CSV file that is read, and"),
+    (["--format", "bvh", "--up", "Z"], "--up is that of a BVH, TRC, C3D or CSV file that is read, and"),
+    (["--format", "ply", "--preset", "unreal"], "--preset changes no PLY files"),
+])  # fmt: skip
+def test_an_option_of_another_input_is_refused(
+    empty: ModuleType, small_run: SmallRun, tmp_path: Path, capfd: pytest.CaptureFixture[str], more: list[str], said: str
+) -> None:
+    assert main(["export", str(small_run.out), *more, "--out", str(tmp_path / "a")]) == 2
+    assert said in capfd.readouterr().err and not list(tmp_path.glob("a*"))
+    if said.startswith("--u"):
+        command = ["retarget", str(small_run.out), "--rig", str(tmp_path / "r.blend"), "--out", str(tmp_path / "a.blend"), *more[2:]]
+        assert main(command) == 2 and said in capfd.readouterr().err
 
 
 def test_a_file_whose_name_is_no_text_is_not_given_to_blender(empty: ModuleType, tmp_path: Path) -> None:

@@ -285,6 +285,8 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
     (["--simplify", "nan"], "is out of range"), (["--preview", "a.jpg"], "--preview a.jpg is not a .png file"),
     (["--film", "a.mpg"], "is not a .mp4 file"), (["--turn", "nan"], "--turn nan is out of range"),
     (["--elevation", "-86"], "choose an angle of -85 to 85 degrees"), (["--from", "361"], "--from 361 is out of range"),
+    (["--from", "30"], "--from moves the camera of --film, which was not given; leave it out"),
+    (["--field", "Wyvill"], "--field is the field function of --implicit, which was not given"),
     (["--turntable", "a"], "is not a .mp4 file"), (["--turntable", "a\udcff.mp4"], "is not UTF-8; rename it"),
 ])  # fmt: skip
 def test_what_a_scene_cannot_be_made_of_is_told_before_it_is_written(

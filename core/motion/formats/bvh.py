@@ -5,15 +5,15 @@ The format has no unit and no up axis: both are estimated from the skeleton's si
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ...foundation import bounded, store
 from ...foundation.errors import InputError
-from ...geometry.rotation import about, euler_from_matrix, shortest, unit
-from ..plausible import check_places
+from ...geometry.rotation import about, between, euler_from_matrix, shortest, unit
+from ..plausible import check_places, check_span
 from ..retarget.rig import Motion, Rig
 
 DEEPEST = 256  # joints in a chain: a tail or a braid has some dozens
@@ -25,6 +25,8 @@ TINY = 1e-6  # by the skeleton's size: bones below it have no length
 STUB = 0.05  # by the skeleton's size: length of a bone without length
 UPRIGHT = 1.5  # by its extent along Y: the extent along Z of a skeleton whose Z is up
 MOVED_M = 1e-5  # a head that moves further relative to its parent needs position channels
+MOST_FILLED = 10  # frames from the first to the last, for each that is there, in a file without frame numbers
+ROUNDING = 1e-6  # of a frame number
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 
@@ -149,7 +151,9 @@ def _values(body: str, columns: int, path: Path) -> tuple[np.ndarray, float]:
         values = np.zeros(0)
     if len(values) < frames * columns:
         raise InputError(f"{path} promises {frames} frames of {columns} values but holds {len(values)} good values; export it again.")
-    table = values[: frames * columns].reshape(frames, columns)
+    if len(values) > frames * columns:
+        raise InputError(f"{path} has values of {len(values) / max(columns, 1):g} frames, and “Frames: {frames}”; correct that number.")
+    table = values.reshape(frames, columns)
     if not np.isfinite(table).all():
         raise InputError(f"{path} holds values that are no finite numbers; export it again.")
     check_places(table, f"{path} is a motion")
@@ -241,11 +245,13 @@ def _distinct(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "ZXY", names: dict[str, str] | None = None) -> None:
-    """Write a motion, Y up. `order`: of the rotation channels; `names`: other names for bones.
+    """Write a motion, Y up, with a row for each of its evenly timed frames. `order`: of the rotation channels; `names`: other names for
+    bones.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: the file cannot be written, or most frames between its first and its last are missing.
     """
+    motion = evenly_timed(motion)
     rig, to_file = motion.rig, Z_UP_FROM_Y_UP.T
     since_rest = to_file @ (motion.R @ np.swapaxes(rig.R_rest, -1, -2)) @ to_file.T
     head_rest, tail_rest, place = (x @ to_file.T / unit_m for x in (rig.head_m, rig.tail_m, motion.head_m))
@@ -284,6 +290,28 @@ def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "
     table = np.concatenate(columns, axis=1)
     lines += [" ".join(f"{value:.6f}" for value in row) for row in table]
     store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def evenly_timed(motion: Motion) -> Motion:
+    """The motion with frames at equal distances, numbered one by one at their own rate: BVH has no frame numbers. Frames that are missing
+    in between are interpolated.
+
+    Raises:
+        InputError: very many are missing.
+    """
+    steps = np.diff(motion.frames)
+    if (steps == 1).all():
+        return motion
+    whole = (motion.frames % 1 == 0).all()
+    step = float(np.gcd.reduce(steps.astype(np.int64))) if whole else float(steps[0]) if np.allclose(steps, steps[0]) else 1.0
+    frames = motion.frames[0] + step * np.arange(1 + int((motion.frames[-1] - motion.frames[0]) / step + ROUNDING))
+    R, head_m = motion.R, motion.head_m
+    if len(frames) != len(motion.frames) or not np.allclose(frames, motion.frames):
+        check_span(0, len(frames), len(motion.frames), "BVH has a row for every frame; there is a motion", MOST_FILLED)
+        row = np.clip(np.searchsorted(motion.frames, frames, side="right") - 1, 0, len(steps) - 1)
+        part = ((frames - motion.frames[row]) / steps[row])[:, None]
+        R, head_m = between(R[row], R[row + 1], part), head_m[row] + part[..., None] * (head_m[row + 1] - head_m[row])
+    return replace(motion, fps=motion.fps / step, frames=np.arange(len(frames)), R=R, head_m=head_m, residual=None)
 
 
 def _free_heads(motion: Motion) -> np.ndarray:

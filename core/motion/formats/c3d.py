@@ -21,7 +21,7 @@ import numpy as np
 
 from ...foundation import bounded, store
 from ...foundation.errors import InputError
-from ..plausible import check_places
+from ..plausible import check_places, check_span
 from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
 BLOCK = 512
@@ -95,6 +95,7 @@ def without_gaps(markers: Markers, where: object) -> Markers:
     steps = np.diff(markers.frames)
     if (steps == 1).all():
         return markers
+    check_span(markers.frames[0], markers.frames[-1], len(markers.frames), f"{where} cannot be written: there are points")
     t, n = int(markers.frames[-1] - markers.frames[0]) + 1, len(markers.names)
     if (steps < 1).any() or t * n * 4 > MOST_VALUES:
         raise InputError(

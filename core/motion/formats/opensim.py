@@ -24,6 +24,7 @@ from .markers import AXES
 TURNS = ("rz", "rx", "ry")  # the first one turns about the axis of the parent
 AXIS = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 MOVES = 5e-5  # metres: a head that moves less relative to its parent is rigidly attached
+MARK = "<!-- As Tricap wrote it: "  # and a digest of all before it
 CREDITS = "Written by Tricap for kinematics: lengths are measured, masses are not."
 MODEL_BYTES = 1 << 26  # of an earlier export
 MASS_KG, INERTIA = "1", "0.01 0.01 0.01 0 0 0"
@@ -59,11 +60,11 @@ def write_opensim(path: Path, motion: Motion, *, names: dict[str, str] | None = 
 
 def _check_replaceable(model: Path) -> None:
     try:
-        ours = not model.exists() or CREDITS.encode() in bounded.bytes_of(model, MODEL_BYTES)
+        ours = not model.exists() or _is_as_written(bounded.bytes_of(model, MODEL_BYTES))
     except OSError:
         ours = False
     if not ours:
-        raise InputError(f"{model} exists and is not of an earlier export; choose another name, so that it is not overwritten.")
+        raise InputError(f"{model} exists and is not of an earlier export, or was edited; choose another name.")
 
 
 def component_names(names: list[str]) -> list[str]:
@@ -108,7 +109,16 @@ def _model(name: str, rig: Rig, bodies: list[str], moving: set[int], A: np.ndarr
         parent = f"/bodyset/{bodies[a]}" if a >= 0 else "/ground"
         _add_joint(in_joints, body, parent, place, moves=b in moving)
     ElementTree.indent(document)
-    return bytes(ElementTree.tostring(document, encoding="utf-8", xml_declaration=True))
+    return _marked(bytes(ElementTree.tostring(document, encoding="utf-8", xml_declaration=True)))
+
+
+def _marked(model: bytes) -> bytes:
+    """A document with a comment at its end by which a later export recognises that nobody has edited it."""
+    return model + f"\n{MARK}{store.digest(model)} -->\n".encode()
+
+
+def _is_as_written(model: bytes) -> bool:
+    return model == _marked(model.rpartition(f"\n{MARK}".encode())[0])
 
 
 def _add_joint(joints: ElementTree.Element, body: str, parent: str, place: np.ndarray, *, moves: bool) -> None:

@@ -15,7 +15,7 @@ from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
 from tricap.core.checking.take_check import check_first_frame
 from tricap.core.cli import main
-from tricap.core.foundation.progress import Monitor
+from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.view_angles import no_view_alike
@@ -227,6 +227,28 @@ def test_a_run_makes_again_what_is_gone_or_cut(finished: Path, tmp_path: Path) -
             assert (out / name).read_bytes() == (finished / "out" / name).read_bytes()
 
 
+def test_a_run_that_came_to_no_end_is_named(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed, which leaves the lock, or stopped after some of its stages; and not where a command was to do no more."""
+    out, given = tmp_path / "out", {"growing": {"spacing_px": 16}}
+
+    def unfinished() -> list[str]:
+        return [f.sentence for f in check_run(out, Monitor()).findings if f.cause == "not finished"]
+
+    def stop(*_: object) -> None:
+        raise Cancelled("Stopped.")
+
+    with monkeypatch.context() as patch, pytest.raises(Cancelled):
+        patch.setattr(pipeline, "write_report", stop)
+        pipeline.run(plane_take, out, given, frames=(0, 2))
+    assert unfinished() == [f"The run in {out} ended before its stage “report” was done."]
+    assert main.main(["track", str(plane_take), "--out", str(out), "--frames", "0:2", "--quiet", "--set", "growing.spacing_px=16"]) == 0
+    assert unfinished() == []
+    pipeline.run(plane_take, out, given, frames=(0, 2))
+    assert unfinished() == []
+    (out / ".tricap-lock").write_text('{"pid": 1}')
+    assert unfinished() == [f"A run in {out} was killed before its end, or is still at work (.tricap-lock)."]
+
+
 def test_the_points_of_a_trunk_lie_on_its_flesh(tmp_path: Path) -> None:
     """A stout person, whose surface is nowhere near the spine, is as well measured as another one; bare shins are told."""
     unpack(SAMPLE, tmp_path / "sample")
@@ -256,3 +278,55 @@ def test_views_from_too_far_apart_are_found():
     (found,) = wide_findings([turned(60)[2], CAMERAS[1]], 1)
     assert "no surface is measured" in found.sentence and no_view_alike([turned(60)[2], CAMERAS[1]], 1) and not no_view_alike(turned(60), 1)
     assert not wide_findings([*turned(60), CAMERAS[0]], 1)  # two others are near enough
+
+
+def changed_rig(folder: Path, old: str, new: str) -> Path:
+    path = folder / "rig.toml"
+    write_rig(path, arm_rig(768))
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("misspelt, known", [("distorsions", "distortions"), ("distortion", "distortions"), ("Distortions", "distortions"),
+                                             ("affinty", "affinity"), ("fish_eye", "fisheye")])  # fmt: skip
+def test_a_misspelt_key_of_a_camera_is_an_error(tmp_path: Path, misspelt: str, known: str) -> None:
+    """All lenses were taken as free of distortion, without a word."""
+    new = f"{misspelt} = " if known == "distortions" else f"{misspelt} = {'true' if known == 'fisheye' else '[0.0, 0.0]'}\ndistortions = "
+    path = changed_rig(tmp_path, "distortions = ", new)
+    said = check_rig(path).lines()
+    assert any(f"has “{misspelt}”, which would be ignored; write “{known}”" in line for line in said), said
+
+
+@pytest.mark.parametrize("old, new, said", [
+    ("distortions = ", "# ", "has no `distortions`: its lens counts as free of distortion"),
+    ("[cam_0]", 'units = "mm"\n[cam_0]', 'write unit = "mm" under [metadata]'),
+    ("[metadata]\nunit", "[Metadata]\nunit", "did you mean [metadata]?"),
+    ("unit = ", "units = ", "“units” under [metadata], which is not read"),
+    ("distortions = ", "sigma = {focal = 5.0}\ndistortions = ", "has “focal”, which is no unknown"),
+    ("distortions = ", "sigmas = {f = 5.0}\ndistortions = ", "has “sigmas”, which is not read; did you mean “sigma”?"),
+])  # fmt: skip
+def test_what_a_rig_lacks_or_names_nearly_is_named_by_the_check_and_the_run(
+    plane_take: Path, tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    path = changed_rig(tmp_path, old, new)
+    if "units" in new:
+        path.write_text(path.read_text(encoding="utf-8").replace('unit = "m"', ""), encoding="utf-8")
+    assert any(said in line for line in check_rig(path).lines()), check_rig(path).lines()
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    text = (take / "rig.toml").read_text(encoding="utf-8")
+    (take / "rig.toml").write_text(text.replace("distortions = ", "# "), encoding="utf-8")
+    with open_run(take, tmp_path / "out", frames=(0, 2)) as job:
+        assert sum("has no `distortions`" in warning for warning in job.record["warnings"]) == 3
+
+
+def test_keys_of_other_tools_and_an_empty_list_of_distortions_are_no_finding(tmp_path: Path) -> None:
+    path = changed_rig(
+        tmp_path, "distortions = ", "rotation_count = 0\nerror = 0.3\nport = 1\nexposure = -5\ngrid_count = 20\ndistortions = "
+    )
+    path.write_text(path.read_text(encoding="utf-8") + "adjusted = false\nerror = 0.0\n[aruco]\nsize = 3\n", encoding="utf-8")
+    assert check_rig(path).findings == ()
+    lines = ["distortions = []" if line.startswith("distortions") else line for line in path.read_text(encoding="utf-8").splitlines()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert check_rig(path).findings == ()

@@ -123,6 +123,26 @@ def test_options_that_need_mending(small: Path, tmp_path: Path, capfd: Capture, 
     assert not (tmp_path / "out").exists()
 
 
+FROM_IMAGES = "belongs to a calibration from images, and not to --import; leave it out"
+BAR = ["calibrate", "{d}", "--bar-length", "0.5", "--out", "{o}"]
+IGNORED = [
+    *([["calibrate", "--import", "{t}/rig.toml", "--out", "{o}", *more], f"{more[0]} {FROM_IMAGES}"] for more in (
+        ["--report", "{d}"], ["--mask", "{d}"], ["--interlaced", "odd"], ["--bar-length", "0.4"], ["--lens", "fisheye"],
+        ["--rates", "L=24"], ["--first-field", "even"], ["--focal-px", "900"], ["--synchronise", "30"], ["--target-diameter", "0.05"])),
+    [[*BAR, "--first-field", "even", "--interlaced", "odd"], "--first-field belongs to --interlaced both; leave it out"],
+    [[*BAR, "--dictionary", "DICT_5X5_50"], "--dictionary describes the markers of --board charuco"],
+    [["track", "{t}", "--out", "{d}", "--points-frame", "2"], "--points-frame is the frame of --points, which were not given"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("argv, said", IGNORED, ids=lambda value: " ".join(value) if isinstance(value, list) else "")
+def test_an_option_that_would_be_ignored_is_refused(small: Path, tmp_path: Path, capfd: Capture, argv: list[str], said: str) -> None:
+    assert main.main([word.format(t=small, d=tmp_path / "d", o=tmp_path / "o.toml") for word in argv]) == 2
+    printed = capfd.readouterr()
+    assert said in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+    assert not (tmp_path / "o.toml").exists() and not (tmp_path / "d").exists()
+
+
 @pytest.mark.parametrize("argv", [["run", "TAKE", "--out", ""], ["run", "", "--out", "o"], ["check", " "], ["batch", "TAKE", "--out", ""]])
 def test_an_empty_name_is_not_the_working_folder(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture, argv: list[str]

@@ -170,3 +170,22 @@ def test_a_stopped_contour_goes_on_with_the_same_vertices(tmp_path: Path, scenes
         assert all(np.array_equal(a.xy_px, b.xy_px) and np.array_equal(a.sigma_px, b.sigma_px) for a, b in zip(whole, again, strict=True))
         recorded.job.settings = {"contour": ContourSettings(spacing_px=8.0)}
         assert ContourCheckpoints(recorded.job, 1, start).load(3) is None
+
+
+@pytest.mark.parametrize("corners, said", [
+    ("0,0\n1e9,0\n1e9,1e9\n", "has corners beyond 1e+06 pixels"),
+    ("0,0\n20000,0\n20000,20000\n", "reaches further beyond the image of view C than that is large"),
+    ("10,10\n-300,10\n20,20\n", "reaches further beyond the image of view C than that is large"),
+    ("40,28\n40,28\n40,28\n", "encloses less than a pixel"),
+    ("10,10\n20,20\n30,30\n40,40\n", "encloses less than a pixel"),
+    ("10,10\n80,60\n" * 600, "has 1200 corners; 1000 is the most"),
+    ("1,1\n1,71\n95,71\n" + "1,1\n95,71\n" * 450, "px long, and 16000 px is the most at contour.spacing_px = 4"),
+])  # fmt: skip
+def test_a_polygon_that_is_none_of_a_person_is_refused_at_once(
+    tmp_path: Path, scenes: Any, capfd: pytest.CaptureFixture[str], corners: str, said: str
+) -> None:
+    """22 bytes took 23 GB."""
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(width=96, height=72), [[]] * 2, noise=0.0)
+    (tmp_path / "p.csv").write_text("x,y\n" + corners)
+    argv = ["contour", str(take), "--view", "C", "--polygon", str(tmp_path / "p.csv"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(argv) == 2 and said in capfd.readouterr().err and not (tmp_path / "out").exists()

@@ -233,6 +233,35 @@ Frame Time: 0.04
 """
 
 
+@pytest.mark.parametrize("frames", [np.arange(0, 50, 5), [0, 1, 2, 3, 20, 21, 22, 23], [4, 6, 12], [0, 0.5, 1, 1.5], [7]])
+def test_a_bvh_keeps_the_time_of_a_motion_without_all_its_frames(tmp_path: Path, frames: list[float]) -> None:
+    whole = flail(person(), 50)
+    t = np.asarray(frames, float)
+    rows = np.linspace(0, 49, len(t)).astype(int)
+    motion = replace(whole, frames=t, R=whole.R[rows], head_m=whole.head_m[rows], residual=None)
+    write_bvh(tmp_path / "a.bvh", motion)
+    found = read_bvh(tmp_path / "a.bvh")
+    seconds = (t - t[0]) / motion.fps
+    at = np.rint(seconds * found.fps).astype(int)
+    assert np.allclose(at / found.fps, seconds, atol=1e-6) and at[-1] == len(found.frames) - 1
+    head_m = found.head_m[:, [found.rig.names.index(name) for name in motion.rig.names]]
+    assert np.abs(head_m[at] - motion.head_m).max() < 1e-4
+    root_m = [np.interp(np.arange(at[-1] + 1), at, motion.head_m[:, 0, i]) for i in range(3)]
+    assert np.allclose(head_m[:, 0].T, root_m, atol=1e-4), "missing frames lie in between"
+
+
+def test_gaps_that_would_make_a_file_many_times_longer_are_refused(tmp_path: Path) -> None:
+    """1.3 kB of text became 480 MB."""
+    points = Markers(names=("a",), fps=25.0, frames=[0, 1, 2, 3_000_000], xyz_m=np.ones((4, 1, 3)), sigma_m=np.ones((4, 1)))
+    with pytest.raises(InputError, match="a.c3d cannot be written: there are points from frame 0 to 3e[+]06, with values for 4 alone"):
+        write_c3d(tmp_path / "a.c3d", points)
+    motion = flail(person(), 2001)
+    with pytest.raises(InputError, match="BVH has a row for every frame; there is a motion from frame 0 to"):
+        write_bvh(tmp_path / "a.bvh", replace(motion, frames=np.append(np.arange(2000), 150_000), residual=None))
+    write_trc(tmp_path / "a.trc", points)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.trc"] and (tmp_path / "a.trc").stat().st_size < 1000
+
+
 def test_a_small_bvh(tmp_path: Path) -> None:
     (tmp_path / "a.bvh").write_text(BVH)
     motion = read_bvh(tmp_path / "a.bvh", unit_m=0.1)
@@ -248,6 +277,7 @@ def test_a_small_bvh(tmp_path: Path) -> None:
         ("HIERARCHY", "SOMETHING", "not a BVH"),
         ("Frames: 2", "Frames: 3000000000", "promises"),
         ("Frames: 2", "Frames: 0", "motion needs"),
+        ("Frames: 2", "Frames: 1", "has values of 2 frames, and “Frames: 1”; correct that number"),
         ("Frames: 2", "Frames: many", "number is needed"),
         ("Xposition", "Sideways", "channels"),
         ("CHANNELS 3", "CHANNELS 300", "channels"),

@@ -72,6 +72,10 @@ def test_a_model_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
     model.unlink()
     for _ in range(2):  # its own model is replaced
         write_opensim(tmp_path / "kick.mot", motion)
+    model.write_text(model.read_text(encoding="utf-8").replace("<mass>1</mass>", "<mass>4.2</mass>"), encoding="utf-8")
+    with pytest.raises(InputError, match="not of an earlier export, or was edited"):
+        write_opensim(tmp_path / "kick.mot", motion)
+    assert "4.2" in model.read_text(encoding="utf-8")
 
 
 def test_names_of_components_are_plain_and_different() -> None:

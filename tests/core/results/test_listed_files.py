@@ -1,6 +1,5 @@
 """Files in a folder of the user's choice: those of an earlier call are replaced and removed, others never."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 from tricap.core.calibration.calibrate import check_report
 from tricap.core.calibration.rig_files import write_as
 from tricap.core.cli import main
+from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rig import read_rig
 from tricap.core.results.listed_files import LIST, PICTURES, PLY, check_files, list_files
@@ -84,7 +84,39 @@ def test_no_report_and_no_batch_among_images(plane_take: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="contains “0000.png”"):
         check_report(plane_take / "L")
     (tmp_path / "coverage.png").write_bytes(b"")
-    (tmp_path / "calibration.json").write_text(json.dumps({}))
+    store.write_json(tmp_path / "calibration.json", {"format": "tricap-calibration", "version": 1})
     check_report(tmp_path)
+    for name, text in (("calibration.json", '{"published": 1}'), ("calibration.txt", "notes of the calibration")):
+        folder = tmp_path / name.replace(".", " ")
+        folder.mkdir()
+        (folder / name).write_text(text)
+        with pytest.raises(InputError, match=f"{name} would be overwritten, and is not of an earlier call"):
+            check_report(folder)
     with pytest.raises(InputError, match="belongs to the take"):
         out_folders([plane_take], plane_take / "C")
+
+
+def test_a_summary_of_somebody_else_is_not_replaced(plane_take: Path, tmp_path: Path, capfd: Capture) -> None:
+    """Names that nobody gave: batch.json, compare.json and compare.html."""
+    for command, name in (("batch", "batch.json"), ("compare", "compare.json"), ("compare", "compare.html")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_text('{"mine": 1}')
+        assert f"{name} would be overwritten" in refused([command, str(plane_take), "--out", str(folder)], capfd)
+        assert (folder / name).read_text() == '{"mine": 1}' and len([*folder.iterdir()]) == 1
+
+
+@pytest.mark.parametrize("name", ["C/0001.png", "rig.toml", "hero.blend", "x.fbx", "notes.csv"])
+def test_2d_tracks_replace_tables_of_their_kind_alone(plane_take: Path, tmp_path: Path, capfd: Capture, name: str) -> None:
+    shutil.copytree(plane_take / "L", tmp_path / "L")
+    (tmp_path / "points.csv").write_text("point,x,y\na,60,60\n")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    argv = ["track2d", str(tmp_path / "L"), "--points", str(tmp_path / "points.csv"), "--frames", "0:2", "--out"]
+    said = refused([*argv, str(tmp_path / name)], capfd)
+    assert (
+        "is not the name of a table; let it end in .csv" in said or "notes.csv would be overwritten, and is not of an earlier call" in said
+    )
+    assert (tmp_path / name).read_text() == "mine"
+    for _ in range(2):
+        assert main.main([*argv, str(tmp_path / "tracks.csv"), "--quiet"]) == 0

@@ -61,6 +61,14 @@ def test_unknown_and_earlier_phases_change_nothing() -> None:
     assert course.fraction == before > 0
 
 
+def test_without_a_surface_the_points_of_single_views_move_the_bar() -> None:
+    course = course_of(STAGES, FRAMES, surface=False)
+    course.step("background", 1, 1)
+    before = course.fraction
+    course.step("follow points", 1, 2)
+    assert 0 < before < 0.1 and course.fraction > before + 0.1
+
+
 def test_a_part_of_a_task_moves_the_bar() -> None:
     monitor = Monitor()
     monitor.course = course_of(STAGES, FRAMES)

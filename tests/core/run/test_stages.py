@@ -24,10 +24,10 @@ from tricap.core.run.stages import (
     STAMPED,
     WITHOUT_STAGE,
     Stamp,
+    coarse_time_stamp,
     known_keys,
     stage_keys,
     stage_of,
-    time_stamp,
     valid_stages,
 )
 from tricap.core.take.footage import open_take
@@ -45,7 +45,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_take(folder, three_cameras(), [[Body()]] * 4)
 
 
-def keys(folder: Path, overrides: dict[str, Any] | None = None, stamp: Stamp = time_stamp, **changes: Any) -> dict[str, str]:
+def keys(folder: Path, overrides: dict[str, Any] | None = None, stamp: Stamp | None = None, **changes: Any) -> dict[str, str]:
     table = read_table(folder) | {"seeds": {"frame": 1, "joints": JOINTS}, "body": {"model": "arm.R"}} | changes
     take = take_of_table(folder, table)
     return stage_keys(open_take(take), take_run.settings_of(take.settings, overrides or {}, "the test"), folder / "out", stamp)
@@ -129,6 +129,30 @@ def test_footage_exported_again_with_the_same_size_concerns_everything(take: Pat
     path = tmp_path / "take" / "L" / "0002.png"
     os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns + 2_000_000_000))
     assert all(a != b for a, b in zip(keys(take).values(), keys(tmp_path / "take").values()))
+
+
+def test_another_image_of_the_same_size_and_second_concerns_everything(take: Path, tmp_path: Path) -> None:
+    """Times were compared in whole seconds."""
+    shutil.copytree(take, tmp_path / "take")
+    path = tmp_path / "take" / "L" / "0002.png"
+    os.utime(path, ns=(0, 1_000_200_000_000))
+    run = finished(tmp_path / "take")
+    other_picture(path)
+    os.utime(path, ns=(0, 1_000_900_000_000))
+    assert known(tmp_path / "take", run) == []
+    large = {"stages": {stage: {"key": key} for stage, key in keys(take, stamp=coarse_time_stamp).items()}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tricap.core.run.stages.reads_content", lambda footage: False)
+        for image in (take / "L").glob("*.png"):
+            time = image.stat().st_mtime_ns
+            os.utime(image, ns=(0, time // 1_000_000_000 * 1_000_000_000))
+        assert known(take, large) == list(STAGES), "of a take whose content is not read, a file system with coarse times is the same"
+
+
+def test_a_run_of_a_version_that_compared_whole_seconds_is_still_known(take: Path, tmp_path: Path) -> None:
+    content = keys(take, stamp=FileDigests().stamp)
+    run = {"stages": {s: {"key": key, CONTENT: content[s]} for s, key in keys(take, stamp=coarse_time_stamp).items()}}
+    assert known(take, run) == list(STAGES)
 
 
 def finished(folder: Path) -> dict[str, Any]:
@@ -245,7 +269,7 @@ def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_t
         pipeline.measure(again, Monitor())
         assert {*STAGES, "report"} == set(again.record["stages"]) and not again.notes
     other_picture(path)
-    os.utime(path, (1000, 1000.5))
+    os.utime(path, (1000, 1000))
     with take_run.open_run(take, out, given, (0, 2)) as job:
         assert {*STAGES, "report"} == set(job.record["stages"])
         pipeline.measure(job, Monitor())

@@ -15,6 +15,7 @@ from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 
 SMALL = ArmTakeSettings(frames=2, width_px=384, interlaced="none")
+TINY = ArmTakeSettings(frames=2, width_px=96)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +111,23 @@ def test_other_people_s_folders_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not empty"):
         make_arm_take(tmp_path, ArmTakeSettings(frames=2, width_px=96))
     assert (tmp_path / "L" / "0000.png").read_bytes() == b"precious"
+
+
+def test_changes_of_the_user_outlive_a_new_recording(tmp_path: Path) -> None:
+    make_arm_take(tmp_path, TINY)
+    make_arm_take(tmp_path, TINY)
+    assert not (tmp_path / "take.toml.bak").exists(), "nothing was changed"
+    changed = (tmp_path / "take.toml").read_text().replace("frame = 0", "frame = 1")
+    (tmp_path / "take.toml").write_text(changed)
+    (tmp_path / "L" / "notes.txt").write_text("mine")
+    (tmp_path / "C" / "0009.png").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="0009.png is not of the recording in .* move it elsewhere"):
+        make_arm_take(tmp_path, TINY)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    (tmp_path / "C" / "0009.png").unlink()
+    make_arm_take(tmp_path, TINY)
+    assert (tmp_path / "L" / "notes.txt").read_text() == "mine" and (tmp_path / "take.toml.bak").read_text() == changed
 
 
 def test_cancelled_recording_is_no_take_and_can_be_made_again(tmp_path: Path) -> None:

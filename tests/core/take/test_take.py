@@ -166,6 +166,10 @@ FAULTS = {
     "footage at any depth twice": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = "**/a/**/*.png"\n'), "with more than one"),
     "masks at any depth twice": (text(views=VIEWS + 'masks = "**/**/*.png"\n'), "with more than one"),
     "an endless pattern": (text(views=VIEWS.replace("L/*", "L/" + "[" * 50_000, 1)), "pattern of 5.* characters"),
+    "axes of pixels": (
+        text(more='[[keypoints]]\nfiles = "kp/*.json"\nview = "C"\naxes = "Y up"\n'),
+        "`axes` of the .*kp/.* is for files in space, and these are of pixels; remove it",
+    ),
     "keypoints at any depth twice": (text(more='[[keypoints]]\nfiles = "**/**/*.json"\nview = "C"\n'), "with more than one"),
     "body a word": (text(dict(body='"arm.R"')), "\\[body\\] of .* must be a table"),
     "model a number": (text(more="[body]\nmodel = 3\n"), "`model` under \\[body\\] of .* is 3"),

@@ -1,15 +1,21 @@
 """Corrections by hand: polygons, regions and clicked trajectories; the verdict on every raw trajectory."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tricap.core.checking.take_check import check_take
+from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
+from tricap.core.run.take_run import open_run
 from tricap.core.surface.cloud import PointCloud
-from tricap.core.take.take import Correction
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import Correction, read_take
 from tricap.core.tracking.corrections import corrected_cloud, corrected_tracks, inside_polygon, missed_clicks
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, filter_trajectories, with_kinematics
@@ -79,3 +85,22 @@ def test_a_short_recording_keeps_what_lasts(frames: int) -> None:
     short = with_kinematics(raw.frames, raw.time_s, xyz, raw.sigma_m, np.where(np.isnan(xyz[..., 0]), 0, 1), 0)
     filtered = filter_trajectories(short, SETTINGS)
     assert 0 not in filtered.source and filtered.reason[0] == TrackStatus.TOO_SHORT
+
+
+def test_a_region_that_encloses_nothing_of_the_image_is_named(plane_take: Path, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    text = (take / "take.toml").read_text(encoding="utf-8")
+    for polygon, odd in (
+        ("[[10000, 10000], [10100, 10000], [10100, 10100]]", True),
+        ("[[0, 0], [70, 0], [0, 0]]", True),
+        ("[[10, 10], [60, 10], [60, 60]]", False),
+    ):
+        entry = f'\n[[corrections]]\nkind = "region"\nview = "C"\nframes = [0, 2]\npolygon = {polygon}\n'
+        (take / "take.toml").write_text(text + entry, encoding="utf-8")
+        with open_run(take, tmp_path / "out", frames=(0, 2)) as job:
+            assert any("encloses nothing of the image" in warning for warning in job.record["warnings"]) == odd
+        assert any("encloses nothing of the image" in finding.sentence for finding in check_take(take, Monitor()).findings) == odd
+    for frames in ("frames = [20, 30]", "frames = [4, 5]"):
+        (take / "take.toml").write_text(text + entry.replace("frames = [0, 2]", frames), encoding="utf-8")
+        with pytest.raises(InputError, match="A correction of take in view C is for frame.* and the take has the frames 0 to 3"):
+            open_take(read_take(take))

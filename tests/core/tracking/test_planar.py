@@ -151,5 +151,5 @@ def test_files_that_are_no_tables(tmp_path: Path) -> None:
     path.write_text("x,y,point\n1,2\n", encoding="utf-8")
     with pytest.raises(InputError, match="not at all"):
         read_points(path)
-    path.write_text("x,y\n1,2\n3,4\n5,6\n", encoding="utf-8")
-    assert read_polygon(path).tolist() == [[1, 2], [3, 4], [5, 6]]
+    path.write_text("x,y\n1,2\n3,4\n5,9\n", encoding="utf-8")
+    assert read_polygon(path).tolist() == [[1, 2], [3, 4], [5, 9]]
