@@ -68,6 +68,7 @@ class FitContext:
     found: tuple[str, ...] = ()  # joints that were found without clicks where the fit begins: bones between them have their own lengths
     unsure: tuple[str, ...] = ()  # of these, joints of limbs that are not certain
     in_views: ImageTracks | None = None  # points followed in single views, where none are measured in space
+    turned: np.ndarray | None = None  # (T, D) angles of hands as they were looked for, in place of their priors; NaN of other DOFs
     monitor: Monitor = field(default_factory=Monitor)  # checked for cancellation within the steps
 
     def stretch(self, frames: Sequence[int]) -> "FitContext":
@@ -75,7 +76,8 @@ class FitContext:
         names = ("tracks", "silhouettes", "background", *(() if self.in_views is None else ("in_views",)))
         parts = {name: getattr(self, name).stretch(frames) for name in names}
         clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
-        return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, **parts)
+        turned = None if self.turned is None else self.turned[np.asarray(frames)]
+        return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, turned=turned, **parts)
 
     def pose_observations(self, state: BodyState) -> list[Observation]:
         """Observations of any pose: limits, priors, and no self-collision."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..body.skeleton import bone_frames, frames_of_bones
 from ..geometry.camera import Camera
+from .hands import hand_capsules
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
 from .inputs.silhouettes import near_rays
@@ -103,7 +104,7 @@ class Evidence:
     def near(self, limb: Limb, state: BodyState) -> "Evidence":
         """What is within reach of a limb, and not wholly explained by the rest of a body."""
         rest, at = np.setdiff1d(sorted(state.profiles), limb.outer), state.head_m[limb.bones[0]]
-        reach = float(state.lengths_m[limb.outer].sum()) + BEYOND_M
+        reach = limb.reach_m(state.lengths_m) + BEYOND_M
         close = np.flatnonzero(np.linalg.norm(self.points.xyz_m - at, axis=1) < reach)
         taken = _points_explained(self.points.take(close), state, rest, TAKEN_M)
         left = np.flatnonzero(taken < EXPLAINED)
@@ -225,7 +226,24 @@ class _Capsules:
 def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
     bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
     R, head = frames_of_bones(limb.parameters.skeleton, state.lengths_m, poses, bones)
+    if limb.hand is not None:
+        return _with_fingers(int(bones[0]), hand_capsules(limb.hand == "L"), float(state.lengths_m[bones[0]]), head[:, 0], R[:, 0])
     return _Capsules.of(state, bones, free_bones(limb.parameters), head, R)
+
+
+def _with_fingers(b: int, capsules: tuple[np.ndarray, np.ndarray], length_m: float, head: np.ndarray, R: np.ndarray) -> _Capsules:
+    """A hand with its fingers in N poses, of which `head` (N, 3) and R (N, 3, 3) are the wrists and axes."""
+    ends, radii = (a * length_m for a in capsules)
+    along = ends[:, 1] - ends[:, 0]
+    lengths = np.linalg.norm(along, axis=1)
+    return _Capsules(
+        bones=np.full(len(ends), b),
+        first_m=head[:, None] + ends[:, 0] @ R.transpose(0, 2, 1),
+        axis=(along / lengths[:, None]) @ R.transpose(0, 2, 1),
+        length_m=lengths,
+        radii_m=radii.astype(np.float32),
+        posed=np.ones(len(ends), dtype=bool),
+    )
 
 
 def _others(limb: Limb, state: BodyState) -> np.ndarray:
@@ -361,6 +379,6 @@ def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others
     if len(others):
         rows, bone = near_pairs(flat, state, np.zeros(len(state.lengths_m)), others)
         inside = _largest(rows, -gap_to_bone(flat[rows], state, bone), len(flat)).reshape(shape) / radius
-        clear = (k > 0)[:, None] | (PLACES > CLEAR_OF_JOINT)
+        clear = (capsules.bones[k] != capsules.bones[0])[:, None] | (PLACES > CLEAR_OF_JOINT)
         wrong += np.minimum(inside, 1.0) * clear
     return np.asarray((wrong * area).sum(axis=(1, 2)))

@@ -6,7 +6,10 @@ from functools import lru_cache
 import numpy as np
 
 from ..body.skeleton import frames_of_bones
-from .state import ShapeParameters, free_bones
+from .hands import REACH, is_hand, thumb_side
+from .state import FIRM_PRIOR, ShapeParameters, free_bones
+
+CARRIED = 0.5  # of the limits of a hand's angle with a firm prior, where its arm is looked for; the hand itself is turned afterwards
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -17,7 +20,7 @@ class Limb:
     bones: np.ndarray  # those with a pose to be observed, from the body outwards
     outer: np.ndarray  # these and the bones that they carry: a hand
     columns: np.ndarray  # (C,) its DOFs
-    low: np.ndarray  # (C,) their limits
+    low: np.ndarray  # (C,) where they are looked for: within their limits, of a hand that an arm carries nearer to the middle
     high: np.ndarray  # (C,)
 
     @staticmethod
@@ -32,6 +35,10 @@ class Limb:
         twist = (skeleton.dof_bone == above) & free[above] & np.array([dof.axis == "y" for dof in skeleton.dofs])
         columns = np.flatnonzero((np.isin(skeleton.dof_bone, bones) | twist) & ~np.isin(np.arange(len(skeleton.dofs)), skeleton.locked))
         low, high = np.array([skeleton.dofs[c].limits for c in columns]).reshape(-1, 2).T
+        firm = np.array(
+            [skeleton.dofs[c].prior_sigma <= FIRM_PRIOR and is_hand(skeleton.bones[skeleton.dof_bone[c]].name) for c in columns]
+        )
+        low, high = (np.where(firm & (len(bones) > 1), CARRIED * limit, limit) for limit in (low, high))
         return Limb(parameters=parameters, bones=bones, outer=outer, columns=columns, low=low, high=high)
 
     @property
@@ -39,9 +46,19 @@ class Limb:
         """The bone that carries it."""
         return int(self.parameters.skeleton.parents[self.bones[0]])
 
+    @property
+    def hand(self) -> str | None:
+        """The side of a hand alone, "L" or "R"; None for other limbs."""
+        name = self.parameters.skeleton.bones[self.bones[0]].name
+        return name[-1] if is_hand(name) and len(self.outer) == 1 else None
+
+    def reach_m(self, lengths_m: np.ndarray) -> float:
+        """How far it reaches from where it begins, in a body with bones of these lengths (B,)."""
+        return float(lengths_m[self.outer].sum()) * (1.0 if self.hand is None else REACH)
+
     def poses(self, pose: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,)."""
-        whole = np.tile(pose, (len(angles), 1))
+        """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,), or in poses (N, D) with angles (1, C)."""
+        whole = np.array(np.broadcast_to(pose, (max(len(angles), len(np.atleast_2d(pose))), pose.shape[-1])))
         whole[:, self.columns] = angles
         return whole
 
@@ -55,10 +72,17 @@ class Limb:
         return self.parameters.state(pose, vector).head_m[self.bones[0]]
 
     def ends(self, poses: np.ndarray, vector: np.ndarray) -> np.ndarray:
-        """The tails (N, E, 3) of its bones in poses (N, D), of a body with the shape vector (S,)."""
+        """The tails (N, E, 3) of its bones in poses (N, D), of a body with the shape vector (S,).
+
+        Of a hand alone the tail and its thumb's side, in the axes that it would have with angles of 0: its arm may move.
+        """
         lengths = self.parameters.body(vector)[0]
         R, head = frames_of_bones(self.parameters.skeleton, lengths, poses, self.bones)
-        return np.asarray(head + lengths[self.bones, None] * R[..., 1])
+        if self.hand is None:
+            return np.asarray(head + lengths[self.bones, None] * R[..., 1])
+        straight = frames_of_bones(self.parameters.skeleton, lengths, self.poses(poses, np.zeros((1, len(self.columns)))), self.bones)[0]
+        places = lengths[self.bones] * np.stack([np.eye(3)[1], thumb_side(self.hand == "L")], axis=1)  # (3, 2)
+        return np.asarray((straight[:, 0].transpose(0, 2, 1) @ R[:, 0] @ places).transpose(0, 2, 1))
 
 
 def limbs_of(parameters: ShapeParameters) -> dict[int, Limb]:

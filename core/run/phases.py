@@ -14,6 +14,7 @@ COST: dict[str, dict[str, tuple[float, float]]] = {
         "fit the click frame": (6.0, 0.0),
         "fit frame after frame": (0.0, 0.4),
         "follow the limbs": (0.0, 0.25),
+        "turn the hands": (0.0, 0.05),
         "adjust the sequence": (0.0, 0.36),
         "sigmas of the fit": (0.5, 0.12),
         "relief": (7.0, 0.03),

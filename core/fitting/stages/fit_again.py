@@ -37,6 +37,7 @@ from .long_sequence import FrameResults, Recording, frame_results
 from .sequence import PATCH, SLIGHT_SIGMAS, frame_statuses, posterior, standing, whole_sequence
 from .set_up import acceleration_sigmas, clicks_by_frame, context_of, point_tracks
 from .sigma_parts import CLOTH_M, known
+from .turned_hands import angles_of_hands
 
 REACH_S = 0.4  # from a click to the last frame that it may change
 HELD = 2  # frames at each end: accelerations tie three
@@ -125,7 +126,7 @@ def _recording(given: FitInput, earlier: EarlierFit, settings: FitSettings, own:
         tracks=JointTracks(given, names),
     )
     points = [thinned(cloud, settings.voxel_m) for cloud in given.clouds]
-    fit = replace(fit, monitor=monitor).with_exact_outlines(points)
+    fit = replace(fit, monitor=monitor, turned=angles_of_hands(fit, before)).with_exact_outlines(points)
     observed = np.ones(earlier.values.shape, dtype=bool)
     whole = Recording(
         fit=fit,

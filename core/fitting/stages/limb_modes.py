@@ -97,7 +97,7 @@ def _modes(limb: Limb, near: Evidence, pose: np.ndarray, vector: np.ndarray) -> 
 def _mixed(limb: Limb, modes: Sequence[LimbModes], time_s: np.ndarray) -> Elsewhere:
     """The probabilities (1) of the poses of all frames, and (2)."""
     step = np.diff(time_s)
-    jump = [_jump(a, b, float(h)) for a, b, h in zip(modes, modes[1:], step)]
+    jump = [_jump(limb, a, b, float(h)) for a, b, h in zip(modes, modes[1:], step)]
     ahead, back = [np.zeros(len(modes[0].gain))], [np.zeros(len(modes[-1].gain))]
     for t, m in enumerate(jump):
         ahead.append(np.logaddexp.reduce((ahead[-1] + modes[t].gain / GAIN)[:, None] - m, axis=0))
@@ -124,6 +124,6 @@ def of_joints(limbs: Sequence[Elsewhere], skeleton: Skeleton, frames: int) -> np
     return variance
 
 
-def _jump(a: LimbModes, b: LimbModes, step_s: float) -> np.ndarray:
+def _jump(limb: Limb, a: LimbModes, b: LimbModes, step_s: float) -> np.ndarray:
     """m (K, L) between the poses of two frames."""
-    return np.minimum(unlikely(b.ends_m[None] - a.ends_m[:, None], step_s), LARGEST_JUMP)
+    return np.minimum(unlikely(limb, b.ends_m[None] - a.ends_m[:, None], step_s), LARGEST_JUMP)

@@ -35,6 +35,7 @@ IMPROVED, IMPROVED_RAD, IMPROVEMENTS = 6, float(np.radians(12.0)), 24  # of the 
 DIFFERENT_M = 0.04  # between the ends of two poses that go on
 GAIN = 10.0  # voxels that weigh as much as a probability ratio of e
 SIGMA_M, ACCELERATION_M_S2 = 0.02, 40.0  # σ = SIGMA_M + ACCELERATION_M_S2 Δt²
+HANDS = 0.01, 8.0  # … of hands, against their arms
 LARGEST_JUMP = 14.0
 VELOCITY_KEPT = 0.8
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights
@@ -77,7 +78,7 @@ def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> n
     runs = [(limb, begin, course) for limb, begin in begins for course in _courses(begin, len(motion)) if len(course) > 1]
     for i, (limb, begin, course) in enumerate(runs):
         part = monitor.part(STAGE, len(runs) + i, 2 * len(runs))
-        _put(given, motion, limb, _best_way(given, motion, limb, course, begin is None, part))
+        _put(given, motion, limb, best_way(given, motion, limb, course, begin is None, part))
     return motion
 
 
@@ -103,33 +104,34 @@ def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way, ancho
     for stretch in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
         if not len(stretch):
             continue
-        gain = sum(_gain_by_way(given, int(t), motion[t], limb, angles[int(t)]) for t in stretch)
+        gain = sum(gain_by_way(given, int(t), motion[t], limb, angles[int(t)]) for t in stretch)
         around = np.arange(max(stretch[0] - 2, 0), min(stretch[-1] + 3, len(motion)))
         replaced = np.where(np.isin(around, stretch)[:, None, None], by_way[around], tracked[around])
-        smoother = _unevenness(tracked[around], given.time_s[around]) - _unevenness(replaced, given.time_s[around])
+        smoother = _unevenness(limb, tracked[around], given.time_s[around]) - _unevenness(limb, replaced, given.time_s[around])
         evener = anchored and smoother + min(gain, 0.0) / GAIN > LEAST_BETTER
         if evener or gain / GAIN + smoother > LEAST_BETTER * len(stretch):
             found.update({int(t): angles[int(t)] for t in stretch})
     return found
 
 
-def _unevenness(ends_m: np.ndarray, time_s: np.ndarray) -> float:
+def _unevenness(limb: Limb, ends_m: np.ndarray, time_s: np.ndarray) -> float:
     """What (1) costs a limb whose ends (T, E, 3) move in this way, apart from what it explains."""
     cost, velocity = 0.0, np.zeros_like(ends_m[0])
     for before, now, step_s in zip(ends_m, ends_m[1:], np.diff(time_s)):
-        away = float(unlikely(now - before - VELOCITY_KEPT * step_s * velocity, float(step_s)))
+        away = float(unlikely(limb, now - before - VELOCITY_KEPT * step_s * velocity, float(step_s)))
         cost += min(away, LARGEST_JUMP)
         velocity = (now - before) / step_s if away <= LARGEST_JUMP else np.zeros_like(now)
     return cost
 
 
-def unlikely(apart_m: np.ndarray, step_s: float) -> np.ndarray:
-    """|X − X̂|² / 2σ² of (1) (...,) for differences (..., E, 3) after a time."""
-    sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
+def unlikely(limb: Limb, apart_m: np.ndarray, step_s: float) -> np.ndarray:
+    """|X − X̂|² / 2σ² of (1) (...,) for differences (..., E, 3) of a limb's ends after a time."""
+    least, acceleration = (SIGMA_M, ACCELERATION_M_S2) if limb.hand is None else HANDS
+    sigma = least + acceleration * step_s**2
     return np.asarray((apart_m**2).sum(axis=(-2, -1)) / (2 * sigma**2))
 
 
-def _gain_by_way(given: PoseTracking, t: int, pose: np.ndarray, limb: Limb, angles: np.ndarray) -> float:
+def gain_by_way(given: PoseTracking, t: int, pose: np.ndarray, limb: Limb, angles: np.ndarray) -> float:
     """How much more a limb explains with other angles (C,) than in a pose (D,) of frame index `t`, in voxels."""
     near = given.fit.seen(t, given.points[t]).near(limb, given.state(pose))
     poses = limb.poses(pose, np.stack([pose[limb.columns], angles]))
@@ -183,7 +185,7 @@ def _meeting(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range,
     for n, (one, other) in enumerate(zip(ahead, back[::-1])):
         step_s = float(given.time_s[frames[n + 1]] - given.time_s[frames[n]])
         expected = one.ends_m + VELOCITY_KEPT * step_s * one.velocity_m_s
-        away = unlikely(other.ends_m[None] - expected[:, None], step_s)
+        away = unlikely(limb, other.ends_m[None] - expected[:, None], step_s)
         total = one.cost[:, None] + other.cost[None] + np.minimum(away, LARGEST_JUMP)
         if total.min() < best:
             best, place = float(total.min()), (n, *divmod(int(np.argmin(total)), total.shape[1]))
@@ -193,7 +195,7 @@ def _meeting(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: range,
     return [*before, *after]
 
 
-def _best_way(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor) -> Way:
+def best_way(given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], anywhere: bool, monitor: Monitor) -> Way:
     """A limb's best way: without the first frame, where it stays, or with it if it may begin anywhere."""
     ways = _ways(given, motion, limb, frames, anywhere, monitor)
     return _traced(ways, [frames[0], *frames] if anywhere else frames, int(np.argmin(ways[-1].cost)))
@@ -238,7 +240,7 @@ def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, ne
     gain, ends = limb_gains(near, limb, poses, vector, FINE_M), limb.ends(poses, vector)
     anew = step_s == 0  # the first frame of an unsure limb: any pose is as probable before it is seen
     expected = ways.ends_m + VELOCITY_KEPT * step_s * ways.velocity_m_s
-    away = unlikely(ends[:, None] - expected[None], step_s)
+    away = unlikely(limb, ends[:, None] - expected[None], step_s)
     total = ways.cost[None] + np.minimum(away, LARGEST_JUMP) * (not anew)
     before = np.argmin(total, axis=1)
     cost = total[np.arange(len(tried)), before] - gain / GAIN

@@ -2,7 +2,8 @@
 
 1. The clicked joints determine pose and bone lengths at the click frame (`inverse_kinematics`).
 2. At that frame the cloud determines pose and radii (`click_frame`).
-3. With that shape fixed, poses are tracked frame after frame, forwards and backwards (`pose_tracking`).
+3. With that shape fixed, poses are tracked frame after frame, forwards and backwards (`pose_tracking`), limbs are followed on their ways
+   (`limb_paths`), and hands are turned as they are seen (`turned_hands`).
 4. One adjustment over the whole sequence: one shape, a pose per frame, coupled over time by tracked points and weak accelerations. Frames
    whose residuals stay suspicious restart once from between their neighbours.
 5. Where the complete model is asked for, it is made from that body (`body.complete`), and step 4 is repeated with its radii.
@@ -67,6 +68,7 @@ from .long_sequence import (
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
 from .set_up import acceleration_sigmas, fit_context, point_tracks, with_start
 from .sigma_parts import known, sigma_parts
+from .turned_hands import angles_of_hands, priors_at, turn_hands
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
 
@@ -112,7 +114,7 @@ def fit_and_start(
     first = fit_click_frame(fit, points[fit.click], monitor)
     tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=point_tracks(given, fit))
     motion, observed = track_poses(tracking, monitor, checkpoints)
-    motion = follow_limbs(tracking, motion, monitor)
+    motion = turn_hands(tracking, follow_limbs(tracking, motion, monitor), monitor)
     if given.start is not None and (contradicted := taken_back(fit, given.start, points, motion, first.vector, monitor)):
         raise NeedsClick(contradicted)
     start = SequenceStart(motion=motion, observed=observed, first=first)
@@ -144,7 +146,7 @@ def _adjusted_body(
     """Step 4 and those after it."""
     fit, points, first, motion = tracking.fit, tracking.points, tracking.first, start.motion
     settings = replace(fit.settings, model_patch_m=PATCH * fit.settings.model_patch_m)
-    fit = replace(fit.with_exact_outlines(points), settings=settings)
+    fit = replace(fit.with_exact_outlines(points), settings=settings, turned=angles_of_hands(fit, motion))
     whole = Recording(
         fit=fit,
         frames=given.frames,
@@ -315,14 +317,15 @@ def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
 def whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:
     """The adjustment of poses and shape, with the marginal prior from the frames of earlier stretches."""
     fit, points, feet = part.fit, part.points, part.feet
-    priors, cache = shared_over_time(fit.priors, part.time_s), SegmentationCache()
+    cache = SegmentationCache()
+    priors = [shared_over_time(priors_at(fit, t), part.time_s) for t in range(len(points))]
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [
             *fit.surface_observations(t, points[t], state, cache=cache),
             *fit.joints(t),
             *fit.background.observe(t),
-            *priors,
+            *priors[t],
             *fit.collisions.observe(state),
             *(feet.observe(t) if feet is not None else []),
         ]
