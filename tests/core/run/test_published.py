@@ -39,7 +39,7 @@ OURS = (  # and what must not
     "fitting.inputs.completed_clouds.coarse_surfaces",
     "fitting.inputs.material_tracks.MaterialTracks.__init__",
     "fitting.stages.hidden_limbs.lost_limbs",
-    "fitting.stages.limb_paths._best_way",
+    "fitting.stages.limb_paths.best_way",
     "fitting.stages.joint_places.JointPlaces.applied",
 )
 
