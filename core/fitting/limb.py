@@ -57,8 +57,8 @@ class Limb:
         return float(lengths_m[self.outer].sum()) * (1.0 if self.hand is None else REACH)
 
     def poses(self, pose: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,), or in poses (N, D) with angles (1, C)."""
-        whole = np.array(np.broadcast_to(pose, (max(len(angles), len(np.atleast_2d(pose))), pose.shape[-1])))
+        """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,)."""
+        whole = np.tile(pose, (len(angles), 1))
         whole[:, self.columns] = angles
         return whole
 
@@ -80,9 +80,11 @@ class Limb:
         R, head = frames_of_bones(self.parameters.skeleton, lengths, poses, self.bones)
         if self.hand is None:
             return np.asarray(head + lengths[self.bones, None] * R[..., 1])
-        straight = frames_of_bones(self.parameters.skeleton, lengths, self.poses(poses, np.zeros((1, len(self.columns)))), self.bones)[0]
+        straight = np.array(poses)
+        straight[:, self.columns] = 0.0
+        axes = frames_of_bones(self.parameters.skeleton, lengths, straight, self.bones)[0][:, 0]
         places = lengths[self.bones] * np.stack([np.eye(3)[1], thumb_side(self.hand == "L")], axis=1)  # (3, 2)
-        return np.asarray((straight[:, 0].transpose(0, 2, 1) @ R[:, 0] @ places).transpose(0, 2, 1))
+        return np.asarray((axes.transpose(0, 2, 1) @ R[:, 0] @ places).transpose(0, 2, 1))
 
 
 def limbs_of(parameters: ShapeParameters) -> dict[int, Limb]:
