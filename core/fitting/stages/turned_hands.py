@@ -26,7 +26,7 @@ SIGMA = float(np.radians(21.0))  # of a hand's angles about those that were foun
 
 
 def turn_hands(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> np.ndarray:
-    """The motion (T, D) with the hands on their best ways; the same where no background is known.
+    """The motion (T, D) with the hands on their best ways; the same where no background is known, or no surface.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -71,7 +71,7 @@ def priors_at(fit: FitContext, t: int) -> list[Observation]:
 
 
 def _hands(fit: FitContext) -> list[Limb]:
-    """The hands that are looked for."""
-    if not fit.background.known or not fit.settings.search_limbs:
+    """The hands that are looked for: not where outlines of views all around are all that shows them."""
+    if not fit.background.known or not fit.settings.search_limbs or fit.in_views is not None:
         return []
     return [limb for limb in limbs_of(fit.parameters).values() if limb.hand is not None]

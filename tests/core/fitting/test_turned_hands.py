@@ -1,6 +1,7 @@
 """Hands that are turned as their points and outlines show them, in frames in which the fitted flat hand was turned over."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -121,7 +122,9 @@ def test_a_hand_that_is_right_or_not_seen_stays(tracking) -> None:
     assert np.array_equal(turn_hands(tracking, right, Monitor()), right)
     nothing = CloudPoints(frame=0, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), sigma_m=np.zeros(0))
     bare = replace(tracking, fit=replace(tracking.fit, settings=replace(tracking.fit.settings, search_limbs=False)))
-    for without in (bare, replace(tracking, fit=fit_context(_given_without_background(), FitSettings()), points=[nothing] * FRAMES)):
+    in_views = replace(tracking, fit=replace(tracking.fit, in_views=SimpleNamespace()))
+    unknown = replace(tracking, fit=fit_context(_given_without_background(), FitSettings()), points=[nothing] * FRAMES)
+    for without in (bare, in_views, unknown):
         assert np.array_equal(turn_hands(without, over, Monitor()), over) and angles_of_hands(without.fit, over) is None
 
 
