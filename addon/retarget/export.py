@@ -27,6 +27,7 @@ from ...core.results.run_json import read_run
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
+LISTED = 6  # points in a sentence
 MODEL_ENDING = ".osim"  # of the model that a .mot file moves, next to it
 POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # usual axes and unit of the format
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
@@ -82,11 +83,20 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
         moving = read_motion_source(out, up=up, unit=unit) if kind == "c3d" and _has_segments(out) else None
         return _write_points(kind, file, points_of(out, up=up, unit=unit), program, moving)
     motion = read_motion_source(out, up=up, unit=unit)
+    added = _added(read_points(out, up=up, unit=unit)) if is_of_points(out) else ""
     if kind in SKELETONS:
-        return SKELETONS[kind](file, motion, program)
+        return SKELETONS[kind](file, motion, program) + added
     from .by_blender import export_motion
 
-    return export_motion(kind, out, file, program, motion)
+    return export_motion(kind, out, file, program, motion) + added
+
+
+def _added(points: Markers) -> str:
+    """Which points have no place in some frames, where a skeleton needs one: between others it is interpolated, at the ends held."""
+    frames = (~np.isfinite(points.xyz_m).all(axis=2)).sum(axis=0)
+    some = [f"{name} in {n}" for name, n in zip(points.names, frames) if 0 < n < len(points.frames)]
+    more = f" and {len(some) - LISTED} others" if len(some) > LISTED else ""
+    return f"; frames without a place, which are filled: {', '.join(some[:LISTED])}{more}" if some else ""
 
 
 def _check_complete(out: Path, of: str) -> None:

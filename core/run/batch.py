@@ -228,8 +228,11 @@ def _write(folder: Path, engine: Engine, takes: Sequence[Path], outs: Sequence[P
 
 def summary(outcomes: Sequence[Outcome]) -> list[str]:
     """A table with a line for each take, and the number of takes by status."""
-    width = max(len(Path(o.out).name) for o in outcomes)
-    lines = [f"{Path(o.out).name:<{width}}  {o.status:<13}  {o.seconds:8.1f} s  {o.said}" for o in outcomes]
+    names = [
+        "".join(c if c.isprintable() else ascii(c)[1:-1] for c in Path(o.out).name) for o in outcomes
+    ]  # a line break would forge a row
+    width = max(map(len, names))
+    lines = [f"{name:<{width}}  {o.status:<13}  {o.seconds:8.1f} s  {o.said}" for name, o in zip(names, outcomes)]
     counts = {status: sum(o.status == status for o in outcomes) for status in Status}
     return [*lines, f"{len(outcomes)} takes: " + ", ".join(f"{n} {status}" for status, n in counts.items() if n)]
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from ..body.motion import BodyFit, BodyMotion
-from ..body.shape import body_of, body_text
+from ..body.shape import body_of, body_text, read_body
 from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded
+from ..foundation.errors import InputError
+from ..motion.tables import read_joints, read_motion
 from ..results.folder import Results
 
 STAGE, NAME = "body", "fitted"
@@ -66,6 +68,16 @@ def read_fitted(results: Results, key: str) -> FittedBody | None:
     )
     start = None if values["start"] is None else _start(values["start"])
     return FittedBody(body=body, model=values["model"], start=start)
+
+
+def can_be_read(results: Results) -> bool:
+    """Whether body.toml, motion.csv and joints.csv of a finished fit can be read: a damaged file may be as long as before."""
+    try:
+        read_motion(results.path("motion.csv"), read_body(results.path("body.toml")).skeleton)
+        read_joints(results.path("joints.csv"))
+    except InputError:
+        return False
+    return True
 
 
 def _start_table(start: StartJoints) -> dict[str, Any]:

@@ -63,7 +63,7 @@ from .around_clicks import FITTED_WITH, besides_clicks, fitted_with
 from .closed_loop import FOLDER, OFF, OUTLINES, loop_of, predicted_outlines
 from .engine import Engine
 from .file_digests import reads_content
-from .fitted_body import FittedBody, read_fitted, write_fitted
+from .fitted_body import FittedBody, can_be_read, read_fitted, write_fitted
 from .inspection import example_of_matching
 from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
@@ -233,12 +233,13 @@ def do_stages(run: Run, names: Sequence[str], monitor: Monitor) -> None:
 
 
 def is_complete(run: Run) -> bool:
-    """Whether everything was done with the same input before, and still lies in the folder."""
+    """Whether everything was done with the same input before, and still lies in the folder, undamaged."""
     done = run.record["stages"]
     body = () if "not_done" in done.get("fit", {}) else BODY_FILES[:3]
     surface = () if "not_done" in done.get("measure", {}) else ("clouds", "trajectories.npz")
     files = ("report", *surface, *body)
-    return {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in files)
+    there = {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in files)
+    return there and (not body or can_be_read(run.results))
 
 
 # ---- the steps of the stages ---------------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
     """`frames`, half-open, or None without it."""
     if value is None:
         return None
-    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
+    if not isinstance(value, list) or len(value) != 2 or not all(type(v) is int for v in value) or not 0 <= value[0] < value[1]:
         raise InputError(f"`frames` of {where} is {shown(value)}; write [first, one after the last].")
     return value[0], value[1]
 

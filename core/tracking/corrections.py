@@ -94,10 +94,22 @@ def corrected_tracks(
 
 
 def odd_regions(corrections: Sequence[Correction], rig: Rig) -> list[str]:
-    """A sentence for each region that has nothing of its view's image in it."""
-    odd = [c for c in corrections if c.kind == "region" and _enclosed_px2(c.xy_px, rig[c.view]) < SMALLEST_PX2]
-    where = [f"({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view}" for c in odd]
-    return [f"The corrected region at {place} encloses nothing of the image; draw it again or remove it." for place in where]
+    """A sentence for each region that has nothing of its view's image in it, or all of it."""
+    sentences = []
+    for c in (c for c in corrections if c.kind == "region"):
+        place = f"The corrected region at ({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view}"
+        if _enclosed_px2(c.xy_px, rig[c.view]) < SMALLEST_PX2:
+            sentences.append(f"{place} encloses nothing of the image; draw it again or remove it.")
+        elif inside_polygon(_places(rig[c.view]), c.xy_px).all():
+            frames = f"frame {c.frames[0]}" if len(c.frames) == 1 else f"frames {c.frames[0]} to {c.frames[-1]}"
+            sentences.append(f"{place} encloses the whole image, so that no points remain in {frames}; draw it again or remove it.")
+    return sentences
+
+
+def _places(camera: Camera) -> np.ndarray:
+    """Pixels (N, 2) all over an image."""
+    x, y = (np.linspace(0, size - 1, 40) for size in camera.size_px)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _enclosed_px2(polygon: np.ndarray, camera: Camera) -> float:

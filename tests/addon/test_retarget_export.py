@@ -190,6 +190,18 @@ def test_a_file_whose_name_is_no_text_is_not_given_to_blender(empty: ModuleType,
     assert not list(tmp_path.iterdir())
 
 
+def test_places_that_points_lack_are_said(small_run: SmallRun, tmp_path: Path) -> None:
+    lines = (small_run.out / "joints.csv").read_text().splitlines()
+    last = max(int(line.split(",")[0]) for line in lines[1:])
+    lacking = [line for line in lines if not line.startswith(f"{last},") or "wrist.R" not in line]
+    assert len(lacking) == len(lines) - 1
+    (tmp_path / "points.csv").write_text("\n".join(lacking) + "\n")
+    said = export_file(tmp_path / "points.csv", "bvh", tmp_path / "a.bvh", "plain", Monitor())
+    assert said.endswith("; frames without a place, which are filled: wrist.R in 1")
+    (tmp_path / "points.csv").write_text("\n".join(lines) + "\n")
+    assert "without a place" not in export_file(tmp_path / "points.csv", "bvh", tmp_path / "b.bvh", "plain", Monitor())
+
+
 def test_results_that_are_gone_are_not_left_out_in_silence(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     out = small_run.out
     Results(out).write_run(json.loads((out / "run.json").read_text()))

@@ -56,6 +56,8 @@ def read_bvh(path: Path, *, unit_m: float | None = None, up: str | None = None) 
         raise InputError(f"{path} is not a BVH file: it needs a HIERARCHY and a MOTION.")
     joints = _joints(head, path)
     count = sum(len(j.channels) for j in joints)
+    if not count:
+        raise InputError(f"{path} has no CHANNELS, and so no motion; export it again.")
     if any(column >= count for j in joints for column in j.columns):
         raise InputError(f"{path} gives a joint its CHANNELS twice; it is damaged, export it again.")
     values, fps = _values(body, count, path)

@@ -30,6 +30,7 @@ AXES = {
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "inch": 0.0254}
 MOST_VALUES = 1 << 28  # 2 GB of float64
 DEFAULT_FPS = 25.0  # of tables without times
+UNEVEN = 1.5  # frames by which the time between two rows may be off: those of real cameras jitter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -188,7 +189,7 @@ def rate(frames: np.ndarray, time_s: np.ndarray, where: object) -> float:
     """Frames per second of a table with frame numbers and times.
 
     Raises:
-        InputError: the times do not increase.
+        InputError: the times do not increase, or not as the frame numbers do.
     """
     if len(frames) < 2:
         return DEFAULT_FPS
@@ -198,4 +199,13 @@ def rate(frames: np.ndarray, time_s: np.ndarray, where: object) -> float:
         raise InputError(
             f"{where} has the time {time_s[row + 1]:g} s after {time_s[row]:g} s; times must increase. Correct or remove them."
         )
-    return 1.0 / float(np.median(between / np.maximum(np.diff(frames), 1)))
+    steps = np.diff(frames)
+    usual = 1.0 / float(np.median(between / np.maximum(steps, 1)))
+    uneven = np.flatnonzero(np.abs(between * usual - steps) > UNEVEN)
+    if len(uneven):
+        row = int(uneven[0])
+        raise InputError(
+            f"{where} has uneven times: frame {frames[row + 1]:g} comes {between[row]:g} s after frame {frames[row]:g}, at {usual:.4g} "
+            "frames per second. Number the frames by their times, so that a gap is one in the numbers, too; or remove the column time_s."
+        )
+    return float((frames[-1] - frames[0]) / (time_s[-1] - time_s[0]))

@@ -217,7 +217,11 @@ def test_a_fault_of_a_result_is_named(fault: Callable[[Path], None], finished: P
 @pytest.mark.slow
 def test_a_run_makes_again_what_is_gone_or_cut(finished: Path, tmp_path: Path) -> None:
     again = {"growing": {"spacing_px": 6}, "skin": {"texture_px": 64}}
-    for spoil in (lambda out: (out / "clouds" / "0001.ply").unlink(), lambda out: (out / "joints.csv").write_bytes(b"frame,")):
+
+    def damaged(out: Path) -> None:  # as long as before
+        (out / "joints.csv").write_bytes(b"frame,TIME" + (out / "joints.csv").read_bytes()[10:])
+
+    for spoil in (lambda out: (out / "clouds" / "0001.ply").unlink(), lambda out: (out / "joints.csv").write_bytes(b"frame,"), damaged):
         out = Path(shutil.copytree(finished / "out", tmp_path / "out", dirs_exist_ok=True))
         spoil(out)
         with open_run(finished / "take", out, again, (0, 5)) as job:

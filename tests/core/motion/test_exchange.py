@@ -116,6 +116,22 @@ def test_wide_tables_are_read(tmp_path: Path) -> None:
     assert found.names == ("elbow.R",) and abs(found.fps - 10.0) < 1e-9 and np.isnan(found.xyz_m[1]).all()
 
 
+def test_times_that_do_not_go_with_the_frame_numbers_are_said(tmp_path: Path) -> None:
+    """A gap of ten seconds between frames 1 and 2 became 0.04 s."""
+
+    def read(times: list[float], frames: list[int]) -> Markers:
+        rows = [f"{frame},{time},1,2,3" for frame, time in zip(frames, times)]
+        (tmp_path / "a.csv").write_text("\n".join(["frame,time_s,a x,a y,a z", *rows]) + "\n")
+        return read_points_csv(tmp_path / "a.csv")
+
+    with pytest.raises(InputError, match="uneven times: frame 2 comes 9.96 s after frame 1, at 25 frames per second. Number the frames"):
+        read([0.0, 0.04, 10.0, 10.04, 10.08], [0, 1, 2, 3, 4])
+    assert read([0.0, 0.04, 10.0, 10.04], [0, 1, 250, 251]).fps == pytest.approx(25.0)
+    jitter = 0.012 * np.random.default_rng(0).normal(size=200)
+    assert read([*(np.arange(200) / 30 + jitter.clip(-0.015, 0.015))], [*range(200)]).fps == pytest.approx(30.0, rel=0.01)
+    assert read([round(t / 30, 2) for t in range(3000)], [*range(3000)]).fps == pytest.approx(30.0, rel=1e-4)  # the median would say 33.3
+
+
 @pytest.mark.parametrize(("kind", "axes"), [("trc", "Z up"), ("c3d", "Y up"), ("csv", "Y up")])
 def test_up_and_unit_are_said(tmp_path: Path, kind: str, axes: str) -> None:
     """A file with another axis up lies down unless it is said; and one in another unit than it says is as large as it is."""
@@ -303,7 +319,7 @@ def test_a_bvh_whose_joints_have_no_channels_asks_for_no_memory(tmp_path: Path, 
     joints = "JOINT a { OFFSET 0 0 1 }\n" * still
     head = f"HIERARCHY\nROOT r {{\nOFFSET 0 1 0\nCHANNELS {channels}\n{joints}}}\nMOTION\nFrames: {frames}\nFrame Time: 0.04\n"
     (tmp_path / "a.bvh").write_text(head + "0\n" * (frames if still else 0))
-    with pytest.raises(InputError, match="only .* values for .* joints"):
+    with pytest.raises(InputError, match="only .* values for .* joints" if still else "has no CHANNELS, and so no motion"):
         read_bvh(tmp_path / "a.bvh")
 
 

@@ -44,7 +44,7 @@ FAULTS = {
     "slow.trc": (trc(rate="1e-300"), "1e-300 frames per second"),
     "fast.trc": (trc(rate="inf"), "inf frames per second"),
     "slow.bvh": (bvh(time="1e300"), "1e-300 frames per second"),
-    "sparse.csv": (wide((0, 10**9, 10**9 + 1), (0, 1, 2)), "from frame 0 to 1e\\+09, with values for 3 alone"),
+    "sparse.csv": (wide((0, 10**9, 10**9 + 1), (0, 10**9, 10**9 + 1)), "from frame 0 to 1e\\+09, with values for 3 alone"),
     "far.csv": (wide(x=1e308), "positions beyond"),
     "far.trc": (trc(x=1e308), "positions beyond"),
     "far.bvh": (bvh(offset="0 1e308 0"), "positions beyond"),

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -206,6 +207,8 @@ def test_a_take_whose_results_have_no_place_stops_no_other(takes: list[Path], tm
 def test_the_summary() -> None:
     fine = Outcome(take="/t/a", out="/o/a", status=Status.DONE, said="fine", seconds=61.0)
     lost = Outcome(take="/t/bb", out="/o/bb", status=Status.LOST, said="")
+    (forged, *_, count) = summary([replace(fine, out="/o/zz\nbA    done")])
+    assert forged.startswith("zz\\nbA    done  done") and "\n" not in forged and count == "1 takes: 1 done"
     lines = summary([fine, lost])
     assert lines[0].startswith("a   done") and "61.0 s  fine" in lines[0] and lines[-1] == "2 takes: 1 done, 1 lost"
 

@@ -138,6 +138,7 @@ FAULTS = {
     "reference view": (text(dict(reference_view='"M"')), '`reference_view` of .* is "M"'),
     "frames a number": (text(dict(frames="3")), "`frames` of .* is 3; write"),
     "frames of three": (text(dict(frames="[1, 2, 3]")), "write \\[first, one after the last\\]"),
+    "frames that are no numbers": (text(dict(frames="[false, true]")), "write \\[first, one after the last\\]"),
     "frames backwards": (text(dict(frames="[5, 5]")), "write \\[first, one after the last\\]"),
     "frames negative": (text(dict(frames="[-1, 5]")), "write \\[first, one after the last\\]"),
     "frames not whole": (text(dict(frames="[0.5, 5]")), "write \\[first, one after the last\\]"),

@@ -100,6 +100,11 @@ def test_a_region_that_encloses_nothing_of_the_image_is_named(plane_take: Path, 
         with open_run(take, tmp_path / "out", frames=(0, 2)) as job:
             assert any("encloses nothing of the image" in warning for warning in job.record["warnings"]) == odd
         assert any("encloses nothing of the image" in finding.sentence for finding in check_take(take, Monitor()).findings) == odd
+    whole = entry.replace(polygon, "[[-1000, -1000], [9000, -1000], [9000, 9000], [-1000, 9000]]")
+    (take / "take.toml").write_text(text + whole, encoding="utf-8")
+    assert any(
+        "encloses the whole image, so that no points remain in frames 0 to 1" in f.sentence for f in check_take(take, Monitor()).findings
+    )
     for frames in ("frames = [20, 30]", "frames = [4, 5]"):
         (take / "take.toml").write_text(text + entry.replace("frames = [0, 2]", frames), encoding="utf-8")
         with pytest.raises(InputError, match="A correction of take in view C is for frame.* and the take has the frames 0 to 3"):
