@@ -276,8 +276,8 @@ def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
 
 
 def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
-    """Views that are identical, swapped or frozen, a rig that is impossible or of another recording, from the first frames: about a second
-    in every run.
+    """Views that are identical, swapped or frozen, a rig that is impossible or of another recording, or a camera that was moved or
+    refocused, from the first frames: about a second in every run.
 
     Raises:
         InputError: an image cannot be read.
@@ -289,7 +289,10 @@ def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
     return same_views(pairs, names) or [
         *geometry_findings(footage.rig),
         *frozen,
-        *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px),
+        *(
+            rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
+            or moved_findings(pairs, footage.rig.cameras, names)
+        ),
     ]
 
 

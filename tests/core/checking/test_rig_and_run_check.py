@@ -13,7 +13,7 @@ import pytest
 from tricap.core.checking.findings import Cause
 from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
-from tricap.core.checking.take_check import check_first_frame
+from tricap.core.checking.take_check import check_clouds, check_first_frame
 from tricap.core.cli import main
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
@@ -92,6 +92,17 @@ def test_a_run_warns_of_cameras_at_the_same_position(arm_recording: Callable[...
     a, b, c = footage.rig.cameras
     rig = Rig(cameras=(replace(b, name=a.name), b, c))
     assert "same place" in [finding.cause for finding in check_first_frame(replace(footage, rig=rig), 0)]
+
+
+@pytest.mark.parametrize("width", [1.04, 1.1])
+def test_a_run_warns_of_a_camera_with_another_focal_length(arm_recording: Callable[..., Path], width: float) -> None:
+    """Its rays still meet those of one other camera, so that a body was fitted without a word."""
+    footage = open_take(read_take(arm_recording()))
+    a, b, c = footage.rig.cameras
+    rig = Rig(cameras=(replace(a, matrix=a.matrix * [[width, 1, 1], [1, 1, 1], [1, 1, 1]]), b, c))
+    (finding,) = check_first_frame(replace(footage, rig=rig), 0)
+    assert "along the epipolar lines" in finding.sentence and "calibrate again" in finding.advice
+    assert any("along the epipolar lines" in said for said in check_clouds(replace(footage, rig=rig), [0], [900], [0.1], Monitor()))
 
 
 def test_a_sound_rig_passes_and_a_broken_one_says_why(tmp_path: Path) -> None:
