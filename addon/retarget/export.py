@@ -191,8 +191,10 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program, mov
 
 def _copy_ply(out: Path, folder: Path, of: str) -> str:
     """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
+    first, end = (read_run(out / "run.json") if (out / "run.json").is_file() else {}).get("frames", (0, np.inf))
     files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := list(files_of(out / name, name)))), None)
-    if files is None:
+    files = files and [file for file in files if not file.stem.isdecimal() or first <= int(file.stem) < end]  # not a copy of the user's own
+    if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     check_files(folder, PLY)
     list_files(folder, PLY, [file.name for file in files])

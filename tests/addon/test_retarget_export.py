@@ -18,6 +18,7 @@ from tricap.core.geometry.rotation import matrix_from_euler, shortest
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.results.folder import Results
+from tricap.core.results.run_json import FORMAT, VERSION
 from tricap.core.synthetic.sample import unpack
 
 from .conftest import SmallRun
@@ -135,6 +136,9 @@ def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
     for of, found in (("", "skin"), ("clouds", "clouds"), ("tracked", "tracked")):
         assert export_file(out, "ply", tmp_path / f"of {of}", "plain", Monitor(), of=of) == f"1 files from {found}/"
         assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == found.encode()
+    shutil.copy(out / "clouds" / "0003.ply", out / "clouds" / "0009.ply")
+    (out / "run.json").write_text(json.dumps({"format": FORMAT, "version": VERSION, "frames": [0, 4]}))
+    assert export_file(out, "ply", tmp_path / "of the run", "plain", Monitor(), of="clouds") == "1 files from clouds/"
     (out / "tracked" / "0003.ply").unlink()
     with pytest.raises(InputError, match="has no folder tracked/ with files; run the take first"):
         export_file(out, "ply", tmp_path / "none", "plain", Monitor(), of="tracked")
