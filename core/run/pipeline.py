@@ -427,7 +427,7 @@ def _write_texture(run: Run, body: BodyFit, baker: TextureBaker, monitor: Monito
         views = [texture.View(camera=camera, rgb=rgb) for camera, rgb in zip(run.footage.rig.cameras, images)]
         baker.add(body.motion.values[row], views)
     if rows:
-        texture.write_texture(run.results.path("skin"), baker.finished())
+        texture.write_texture(run.results.path("skin"), baker.finished(monitor))
 
 
 def _known_poses(body: BodyFit, most: int) -> list[int]:

@@ -24,6 +24,7 @@ import numpy as np
 
 from ...foundation import store
 from ...foundation.arrays import frozen
+from ...foundation.progress import Monitor
 from ...foundation.threads import equal_pieces, in_threads
 from ...geometry.camera import Camera
 from ..shape import BodyShape
@@ -124,16 +125,22 @@ class TextureBaker:
             both = (on_cage[a] > DARKEST) & (on_cage[b] > DARKEST)
             found.append(np.log(on_cage[a][both] / on_cage[b][both]))
 
-    def finished(self) -> Texture:
-        """The texture of what was added."""
+    def finished(self, monitor: Monitor | None = None) -> Texture:
+        """The texture of what was added.
+
+        Raises:
+            Cancelled: the monitor was cancelled.
+        """
+        monitor = monitor or Monitor()
         gain = self._exposures()
         seen = self._full | (self._slot > 0)
         placed = seen & (self._trust > LEAST_TRUST)
         seen = placed if placed.any() else seen
         colour = np.zeros((len(self.texel), 3))
         colour[seen] = self._averaged(np.flatnonzero(seen), gain)
+        monitor.check()
         inside = np.clip(self._from_unseen(seen) / RIM_PX - 1, 0, 1)
-        colour = inside[:, None] * colour + (1 - inside)[:, None] * filled(self._texels, colour, inside == 1)
+        colour = inside[:, None] * colour + (1 - inside)[:, None] * filled(self._texels, colour, inside == 1, monitor)
         side = (self._size, self._size)
         rgb, mask, covered = np.zeros((*side, 3)), np.zeros(side, dtype=bool), np.zeros(side, dtype=bool)
         rgb.reshape(-1, 3)[self.texel] = colour

@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 
+from ...foundation.progress import Monitor
 from ...foundation.threads import THREADS
 from .closed_skin import OneSkin
 from .ends import HEAD
@@ -57,8 +58,12 @@ class Texels:
         return np.asarray(self.corners[np.arange(len(self.corners)), self.shares.argmax(axis=1)])
 
 
-def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The colours (N, C) of all texels, from those that were `seen` (N,). 2 s for a whole body and 700,000 texels."""
+def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray, monitor: Monitor) -> np.ndarray:
+    """The colours (N, C) of all texels, from those that were `seen` (N,). 2 s for a whole body and 700,000 texels.
+
+    Raises:
+        Cancelled: the monitor was cancelled.
+    """
     if not seen.any():
         return np.full(colour.shape, PLAIN)
     skin = texels.skin
@@ -75,11 +80,16 @@ def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
     for sources in ways:
         rows = np.flatnonzero(known)
         wanted, common = np.flatnonzero(~known), of_vertices[known[of_vertices]]
-        source, check = sources(rows, wanted), sources(rows, common)
+        monitor.check()
+        source = sources(rows, wanted)
+        monitor.check()
+        check = sources(rows, common)
+        monitor.check()
         wanted, source, common, check = wanted[source >= 0], source[source >= 0], common[check >= 0], check[check >= 0]
         h = _continued(texels, wanted, common, found[common] - found[check], np.zeros(colour.shape[1]), FADING_M)  # (3)
         found[wanted] = np.clip(found[source] + h, low, high)
         known[wanted] = True
+    monitor.check()
     rows, missing = np.flatnonzero(known), np.flatnonzero(~known)
     found[missing] = _continued(texels, missing, rows, found[rows], found[rows].mean(axis=0))
     return found

@@ -26,6 +26,7 @@ from tricap.core.body.skin.texture import (
     nearest_depth,
     write_texture,
 )
+from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import rasterize
 from tricap.core.synthetic.arm import arm_rig
@@ -123,6 +124,28 @@ def test_a_nearer_surface_hides_and_an_unknown_place_is_not_trusted() -> None:
     baker.add(motion, [filmed(camera, motion, 1.0)])
     seen = baker.finished().seen.ravel()[baker.texel]
     assert seen.any() and baker._texels.at(sigma)[seen].max() < 0.009
+
+
+def test_esc_ends_the_filling_of_a_texture(baked: tuple[TextureBaker, Texture]) -> None:
+    """It took 1.5 s, and was asked to stop at its end."""
+
+    class Asked(Monitor):
+        left = 1000
+
+        def check(self) -> None:
+            self.left -= 1
+            if self.left < 0:
+                raise Cancelled
+
+    never = Asked()
+    baked[0].finished(never)
+    checks = 1000 - never.left
+    assert checks >= 5
+    for asked in (1, checks):  # in the middle of the first step, and of the last
+        monitor = Asked()
+        monitor.left = asked - 1
+        with pytest.raises(Cancelled):
+            baked[0].finished(monitor)
 
 
 def test_without_any_view_the_texture_is_plain() -> None:

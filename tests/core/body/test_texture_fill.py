@@ -11,6 +11,7 @@ from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.surface_operators import vertex_normals
 from tricap.core.body.skin.texture import _texels
 from tricap.core.body.skin.texture_fill import HEADS, PLAIN, Texels, filled
+from tricap.core.foundation.progress import Monitor
 
 AHEAD = np.array([0.0, -1.0, 0.0])
 
@@ -32,7 +33,7 @@ def test_the_other_side_and_the_back_have_the_colours_of_what_was_seen() -> None
     places, ahead = t.at(t.skin.vertices_m), t.at(vertex_normals(t.skin.vertices_m, t.skin.faces)) @ AHEAD
     head = t.at(t.skin.weights[:, t.skin.bone_names.index("head")]) > HEADS
     paint, seen = stripes(places), (places[:, 0] > -0.01) & (ahead > -0.1)
-    found = filled(t, np.where(seen[:, None], paint, 0.0), seen)
+    found = filled(t, np.where(seen[:, None], paint, 0.0), seen, Monitor())
     assert np.array_equal(found[seen], paint[seen])
     error = np.abs(found - paint).max(axis=1)
     for hidden in (~seen & (ahead > 0), (ahead < -0.3) & ~head):
@@ -45,7 +46,7 @@ def test_a_head_has_no_second_face() -> None:
     head = t.at(t.skin.weights[:, t.skin.bone_names.index("head")]) > HEADS
     ahead = t.at(vertex_normals(t.skin.vertices_m, t.skin.faces)) @ AHEAD
     paint = stripes(t.at(t.skin.vertices_m))
-    found = filled(t, paint, ahead > 0)
+    found = filled(t, paint, ahead > 0, Monitor())
     behind = head & (ahead < -0.7)
     assert behind.sum() > 50 and found[behind].std() < 0.5 * paint[behind].std()
 
@@ -56,7 +57,7 @@ def test_where_the_surroundings_differ_no_edge_is_left() -> None:
     places = t.at(t.skin.vertices_m)
     seen = (places[:, 0] > 0) | (places[:, 2] < 0.3)
     brighter = 40.0 * (places[:, 0] < 0)
-    found = filled(t, np.repeat((100.0 + brighter)[:, None], 3, axis=1), seen)[:, 0]
+    found = filled(t, np.repeat((100.0 + brighter)[:, None], 3, axis=1), seen, Monitor())[:, 0]
     border = (places[:, 0] < -0.1) & (np.abs(places[:, 2] - 0.31) < 0.01)
     far = (places[:, 0] < -0.1) & (places[:, 2] > places[:, 2].max() - 0.4)
     assert border.any() and far.any() and np.median(found[border]) > 120 and np.abs(found[far] - 100).max() < 10
@@ -65,4 +66,4 @@ def test_where_the_surroundings_differ_no_edge_is_left() -> None:
 def test_nothing_seen_is_plain() -> None:
     t = texels()
     nothing = np.zeros(len(t.corners), dtype=bool)
-    assert (filled(t, np.zeros((len(nothing), 3)), nothing) == PLAIN).all()
+    assert (filled(t, np.zeros((len(nothing), 3)), nothing, Monitor()) == PLAIN).all()
