@@ -73,7 +73,8 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
         small = measured_footage(one, settings["surface"].quality, settings["growing"].spacing_px)
         with tempfile.TemporaryDirectory() as folder, Results(Path(folder)).opened() as results:
             try:
-                for found in measure_frames(small, MeasureSettings.of(settings), results, monitor.part("surface", i, len(chosen))):
+                part = monitor.part("surface", i, len(chosen))
+                for found in measure_frames(small, MeasureSettings.of(settings), results, part, frame):
                     measured[frame] = found.cloud
             except NothingMeasured:
                 continue  # the person may enter later

@@ -251,16 +251,16 @@ def _does_without_surface(run: Run) -> bool:
 
 
 def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], kept: set[int], monitor: Monitor) -> Foreground | None:
-    """As `_measure_frames`; if the first frame shows nothing and no certain cause is found, from another one, or with pairs of views."""
+    """As `_measure_frames`; if the first frame shows hardly anything, for no certain cause, from another one, or with pairs of views."""
     try:
         return _measure_frames(run, summaries, kept, monitor)
     except NothingMeasured as error:
-        if any(cause.certain for cause in causes_of_failure(run.footage, monitor)):
+        if not error.points and any(cause.certain for cause in causes_of_failure(run.footage, monitor)):
             raise
-        begin = other_beginning(run.measured_footage, MeasureSettings.of(run.settings), run.results, monitor)
+        begin = other_beginning(run.measured_footage, MeasureSettings.of(run.settings), run.results, monitor, error.points)
         if begin is None:
             raise
-        run.warn(begin.sentence(error.frame))
+        run.warn(*begin.sentences(error))
         run.begin, growing = begin.frame, run.settings["growing"]
         run.settings["growing"] = replace(growing, pairs=growing.pairs or begin.pairs)
         return _measure_frames(run, summaries, kept, monitor)

@@ -29,29 +29,31 @@ class Beginning:
     points: int
     pairs: bool
 
-    def sentence(self, first: int) -> str:
-        """For the user; `first` is the frame in which nothing was found with the settings of the run."""
-        frame = f" The measurement begins in frame {self.frame}." if self.frame != first else ""
-        pairs = " Points matched in only two views are accepted, as with growing.pairs=true." if self.pairs else ""
-        return f"No surface was found in frame {first}.{frame}{pairs}"
+    def sentences(self, instead: NothingMeasured) -> list[str]:
+        """For the user, if this is another beginning than that of the run, in which nothing or hardly anything was measured."""
+        changes = [f"The measurement begins in frame {self.frame}."] if self.frame != instead.frame else []
+        changes += ["Points matched in only two views are accepted, as with growing.pairs=true."] if self.pairs else []
+        found = f"{'Hardly any' if instead.points else 'No'} surface was found in frame {instead.frame}."
+        return [" ".join([found, *changes])] if changes else []
 
 
-def other_beginning(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Beginning | None:
-    """Where to begin if the first frame shows nothing; None if there is nothing in the other frames that were tried, either, or if every
-    other view looks from too far apart from the reference view.
+def other_beginning(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor, points: int = 0) -> Beginning | None:
+    """Where to begin if the first frame shows no more than some `points`; None if there is nothing in it, nor in the other frames that
+    were tried, or if every other view looks from too far apart from the reference view.
 
     Raises:
         InputError: the images cannot be read.
         Cancelled: the user asked to stop.
     """
-    if no_view_alike(footage.rig.cameras, footage.take.reference):
-        return None
     first, degrees = first_frame(footage), neighbours_deg(footage.rig.cameras, footage.take.reference)
+    usual = Beginning(frame=first, points=points, pairs=settings.growing.pairs)
+    if no_view_alike(footage.rig.cameras, footage.take.reference):
+        return usual if points else None
     frames = _others(footage, settings, first)
     can_pair = len(degrees) > 1 and degrees[1] <= WIDEST_DEG and not settings.growing.pairs
     parts = len(frames) + can_pair * (1 + len(frames))
     tried = [_tried(footage, settings, results, frame, monitor.part("surface", i, parts)) for i, frame in enumerate(frames)]
-    best = max(tried, key=lambda one: one.points, default=Beginning(frame=first, points=0, pairs=False))
+    best = max([usual, *tried], key=lambda one: one.points)
     if can_pair and best.points < ENOUGH:
         paired = replace(settings, growing=replace(settings.growing, pairs=True))
         for i, frame in enumerate(dict.fromkeys((best.frame, first, *frames))):

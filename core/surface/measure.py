@@ -12,6 +12,7 @@ import numpy as np
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..geometry.robust import finite_median
 from ..matching import foreground as fg
 from ..matching.constraints import constrain
 from ..matching.extension import extend
@@ -29,16 +30,21 @@ OF_CLOUDS_FIELD = ("xy_px", "residual_px", "extended")  # of a cloud, which a ch
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")  # stored in single precision
 
 
-class NothingMeasured(InputError):
-    """The first frame of a take gave no surface. `why` is the cause that a check of the footage found, if it did."""
+FEW = 300  # points of the first frame; with fewer, whose rays miss each other, a third view may refuse what two would match
+MISFIT = 0.5  # of the largest misfit of rays that a point may have
 
-    def __init__(self, frame: int, why: str = "") -> None:
-        self.frame, self.why = frame, why
+
+class NothingMeasured(InputError):
+    """The first frame of a take gave no surface, or no more than `points`. `why` is the cause that a check of the footage found, if it
+    did."""
+
+    def __init__(self, frame: int, why: str = "", points: int = 0) -> None:
+        self.frame, self.why, self.points = frame, why, points
         guess = "no matches were found in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
         super().__init__(f"No surface could be measured in frame {frame}: {why or guess + 'or click surface seeds.'}")
 
-    def __reduce__(self) -> tuple[type, tuple[int, str]]:
-        return type(self), (self.frame, self.why)
+    def __reduce__(self) -> tuple[type, tuple[int, str, int]]:
+        return type(self), (self.frame, self.why, self.points)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -67,7 +73,8 @@ def measure_frames(
 
     Raises:
         InputError: the images cannot be read.
-        NothingMeasured: nothing of a person can be measured in the first frame.
+        NothingMeasured: nothing of a person can be measured in the first frame; or hardly anything, with rays that miss each other, if
+            nobody has said that this frame is the `first`.
     """
     starts = FrameStarts(footage, settings, results, first)
     for done, frame in enumerate(starts.order):
@@ -78,8 +85,8 @@ def measure_frames(
         if measured is None:
             now = now or frame_views(footage, frame, settings, first=not done)
             measured = _measure(now, settings, start, part)
-            if not done and not len(measured.cloud.xyz_m):
-                raise NothingMeasured(frame)
+            if not done and _hardly_anything(measured, settings, anything=first is not None):
+                raise NothingMeasured(frame, points=len(measured.cloud.xyz_m))
             _checkpoint(results, measured, footage)
         starts.measured(measured.field, measured.cloud.xyz_m)
         yield measured
@@ -101,6 +108,12 @@ def measure_piece(footage: Footage, settings: MeasureSettings, results: Results,
         if results.load_checkpoint("surface", f"{frame:04d}", key) is None:
             _checkpoint(results, _measure(frame_views(footage, frame, settings, first=False), settings, start, part), footage)
     monitor.step("surface", 1, 1)
+
+
+def _hardly_anything(first: MeasuredFrame, settings: MeasureSettings, *, anything: bool) -> bool:
+    """Whether the first frame shows nothing; or hardly anything, with rays that miss each other, unless `anything` will do."""
+    points, misfit_px = len(first.cloud.xyz_m), finite_median(first.field.residual_px)
+    return not points or (not anything and points < FEW and misfit_px > MISFIT * settings.growing.max_residual_px)
 
 
 def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, monitor: Monitor) -> MeasuredFrame:
