@@ -145,7 +145,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     except NobodyFound as error:
         if clicks_in(run.footage):
             raise
-        return _no_body(run, "no clicked joints", began, str(error))
+        return _no_body(run, "no clicked joints" + " in these frames" * bool(run.footage.take.clicks.joints), began, str(error))
     except NeedsClick:
         raise
     except InputError as error:

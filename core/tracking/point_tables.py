@@ -198,7 +198,7 @@ def read_polygon(path: Path) -> np.ndarray:
     """Vertices (V, 2) of a CSV with the columns x, y.
 
     Raises:
-        InputError: the file cannot be read, has fewer than three different vertices or very many, or encloses nothing.
+        InputError: the file cannot be read, has fewer than three different vertices or very many, encloses nothing, or crosses itself.
     """
     try:
         rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
@@ -213,6 +213,9 @@ def read_polygon(path: Path) -> np.ndarray:
         raise InputError(f"{path} has corners beyond {FARTHEST_PX:g} pixels; write pixels of the image.")
     if len(np.unique(xy, axis=0)) < 3 or _enclosed(xy) < SMALLEST_PX2:
         raise InputError(f"{path} encloses less than a pixel; write three or more corners around the person.")
+    if (crossing := _crossing_sides(xy)) is not None:
+        i, j = crossing
+        raise InputError(f"The sides of {path} after corners {i + 1} and {j + 1} cross; write the corners in order around the person.")
     return xy
 
 
@@ -236,6 +239,21 @@ def check_polygon(polygon_px: np.ndarray, camera: Camera, spacing_px: float, pat
             f"The polygon {path} is {length:.0f} px long, and {MOST_VERTICES * spacing_px:.0f} px is the most at contour.spacing_px = "
             f"{spacing_px:g}; draw it once around the person, or with a larger spacing."
         )
+
+
+def _crossing_sides(polygon_px: np.ndarray) -> tuple[int, int] | None:
+    """The first two sides of a closed polygon (V, 2) that cross in their insides, by the corners at which they begin."""
+    start, along = polygon_px, np.roll(polygon_px, -1, axis=0) - polygon_px
+    for i in range(len(start) - 2):
+        others, ahead = start[i + 2 :] - start[i], along[i + 2 :]
+        turned = np.cross(np.append(along[i], 0.0), np.pad(ahead, ((0, 0), (0, 1))))[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            here = (others[:, 0] * ahead[:, 1] - others[:, 1] * ahead[:, 0]) / turned
+            there = (others[:, 0] * along[i, 1] - others[:, 1] * along[i, 0]) / turned
+        crossed = np.flatnonzero((here > 0) & (here < 1) & (there > 0) & (there < 1))
+        if len(crossed):
+            return i, i + 2 + int(crossed[0])
+    return None
 
 
 def _enclosed(polygon_px: np.ndarray) -> float:

@@ -178,6 +178,7 @@ def test_a_stopped_contour_goes_on_with_the_same_vertices(tmp_path: Path, scenes
     ("10,10\n-300,10\n20,20\n", "reaches further beyond the image of view C than that is large"),
     ("40,28\n40,28\n40,28\n", "encloses less than a pixel"),
     ("10,10\n20,20\n30,30\n40,40\n", "encloses less than a pixel"),
+    ("10,10\n80,60\n80,10\n10,60\n", "after corners 1 and 3 cross; write the corners in order"),
     ("10,10\n80,60\n" * 600, "has 1200 corners; 1000 is the most"),
     ("1,1\n1,71\n95,71\n" + "1,1\n95,71\n" * 450, "px long, and 16000 px is the most at contour.spacing_px = 4"),
 ])  # fmt: skip

@@ -5,11 +5,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
+from tricap.core.geometry.rig import read_rig
 from tricap.core.run import pipeline
 from tricap.core.take.writing import read_table, write_table
 
@@ -49,6 +51,9 @@ def test_where_nobody_is_seen_the_run_says_so(plane_take: Path, tmp_path: Path) 
     assert any(w.startswith("No body was fitted: take.toml has no clicked joints.") for w in job.record["warnings"])
     assert job.record["stages"]["fit"]["not_done"] == "no clicked joints" and not (out / "body.toml").exists()
     assert "No body was fitted" in (out / "report" / "report.html").read_text()
+    at = {c.name: c.project(np.array([[0.0, 0.0, 2.0]]))[0].tolist() for c in read_rig(take / "rig.toml").cameras}
+    write_table(take, read_table(take) | {"seeds": {"frame": 3, "joints": {"neck": at}}})
+    assert pipeline.run(take, out, frames=(0, 2)).record["stages"]["fit"]["not_done"] == "no clicked joints in these frames"
 
 
 def test_running_again_computes_nothing_again(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
