@@ -11,14 +11,15 @@ r_s the limb's radius there; `through` is 1 where points were measured far behin
 voxels of the cloud, so that (3) counts like points. Many poses of one limb are evaluated at once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ..body.skeleton import bone_frames, frames_of_bones
 from ..geometry.camera import Camera
-from .hands import hand_capsules
+from .hands import PALM, hand_capsules, is_hand
 from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
 from .inputs.silhouettes import near_rays
@@ -41,6 +42,7 @@ CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other 
 BEHIND_M = 0.06  # a limb so far before measured points would hide them
 CELL_OF_DEPTH_M = 0.03
 _ZERO, _ONE = np.float32(0), np.float32(1)  # numpy is slower with numbers of another type
+FINGERS = np.s_[len(PALM) :]  # of a hand's capsules
 FAR_AWAY_M = 1e6  # instead of an infinite distance, which products of matrices do not bear
 LARGEST_PX = 1e6  # of an end of a bone in an image: in the plane of a camera a projection has no limit
 
@@ -106,7 +108,9 @@ class Evidence:
         rest, at = np.setdiff1d(sorted(state.profiles), limb.outer), state.head_m[limb.bones[0]]
         reach = limb.reach_m(state.lengths_m) + BEYOND_M
         close = np.flatnonzero(np.linalg.norm(self.points.xyz_m - at, axis=1) < reach)
-        taken = _points_explained(self.points.take(close), state, rest, TAKEN_M)
+        taken, fingers = _points_explained(self.points.take(close), state, rest, TAKEN_M), _fingers(state, rest)
+        if fingers is not None:
+            taken = np.maximum(taken, _weight(_gaps_of_points(self.points.take(close), fingers)[0], TAKEN_M))
         left = np.flatnonzero(taken < EXPLAINED)
         every = 1 + (len(left) - 1) // MOST_NEAR if len(left) else 1
         left = left[::every]
@@ -115,6 +119,8 @@ class Evidence:
             pixel, depth = view.camera.project(at[None])[0], float(view.camera.to_camera(at[None])[0, 2])
             around = view.take(np.linalg.norm(view.xy_px - pixel, axis=1) < reach * view.camera.focal_px / depth)
             share = _cells_explained(around, state, rest, TAKEN_CELLS_M)
+            if fingers is not None:
+                share = np.maximum(share, _weight(_gaps_of_cells(around, fingers)[0], TAKEN_CELLS_M))
             views.append(around.take(share < EXPLAINED))
             shares.append(share[share < EXPLAINED])
         points, area = self.points.take(close[left]), self.point_area * every
@@ -149,8 +155,8 @@ def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.nda
     others = _others(limb, state)
 
     def gains(rows: slice) -> np.ndarray:
-        capsules = _limb_capsules(limb, poses[rows], state)
-        gain = _explained_by(evidence, capsules, state, width_m, UNSEEN, least)
+        capsules, fingers = _limb_capsules(limb, poses[rows], state)
+        gain = _explained_by(evidence, capsules, state, width_m, UNSEEN, least, fingers)
         reached = np.flatnonzero(gain > least)
         if len(reached):
             gain[reached] -= _misplaced(evidence, capsules.take(reached), state, others)
@@ -171,7 +177,7 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
 
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
     """The area of a body's limb that contradicts what is seen: the last sum of (3)."""
-    return float(_misplaced(evidence, _limb_capsules(limb, state.motion[None], state), state, _others(limb, state))[0])
+    return float(_misplaced(evidence, _limb_capsules(limb, state.motion[None], state)[0], state, _others(limb, state))[0])
 
 
 def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, width_m: float) -> float:
@@ -218,31 +224,55 @@ class _Capsules:
         metres = np.maximum(depth, 1e-6) / camera.focal_px
         return camera.project(ends.reshape(-1, 3)).reshape(*ends.shape[:-1], 2), metres.astype(np.float32)
 
+    @property
+    def area_m2(self) -> float:
+        """Of their images, side by side."""
+        return 2 * float((self.radii_m.mean(axis=1) * self.length_m).sum())
+
     def radius(self, k: int | np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """The radius of capsule k, or of several (K, 1), at fractions of its length."""
         return np.asarray(self.radii_m[k, 0] + (self.radii_m[k, 1] - self.radii_m[k, 0]) * fraction)
 
 
-def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
+def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> tuple[_Capsules, _Capsules | None]:
+    """A limb in N poses, and the fingers of a hand that it carries: the fitted hand ends at its knuckles. A hand alone has its fingers."""
     bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
     R, head = frames_of_bones(limb.parameters.skeleton, state.lengths_m, poses, bones)
-    if limb.hand is not None:
-        return _with_fingers(int(bones[0]), hand_capsules(limb.hand == "L"), float(state.lengths_m[bones[0]]), head[:, 0], R[:, 0])
-    return _Capsules.of(state, bones, free_bones(limb.parameters), head, R)
+    fingers = _hand(state, bones, head, R, of_hand=np.s_[:] if limb.hand is not None else FINGERS)
+    if limb.hand is not None and fingers is not None:
+        return fingers, None
+    return _Capsules.of(state, bones, free_bones(limb.parameters), head, R), fingers
 
 
-def _with_fingers(b: int, capsules: tuple[np.ndarray, np.ndarray], length_m: float, head: np.ndarray, R: np.ndarray) -> _Capsules:
-    """A hand with its fingers in N poses, of which `head` (N, 3) and R (N, 3, 3) are the wrists and axes."""
-    ends, radii = (a * length_m for a in capsules)
-    along = ends[:, 1] - ends[:, 0]
-    lengths = np.linalg.norm(along, axis=1)
+def _fingers(state: BodyState, bones: np.ndarray) -> _Capsules | None:
+    """The fingers of hands among some of a body's bones."""
+    return _hand(state, bones, state.head_m[None, bones], state.R[None, bones], of_hand=FINGERS)
+
+
+def _hand(state: BodyState, bones: np.ndarray, head: np.ndarray, R: np.ndarray, of_hand: slice) -> _Capsules | None:
+    """Some of the capsules of the hands among bones (K,), whose frames in N poses are `head` (N, K, 3) and R (N, K, 3, 3); None if there
+    are no hands."""
+    names = [state.skeleton.bones[b].name for b in bones.tolist()]
+    hands = [k for k, name in enumerate(names) if is_hand(name)]
+    if not hands:
+        return None
+    found = []
+    for k in hands:
+        length = float(state.lengths_m[bones[k]])
+        ends, radii = (part[of_hand] * length for part in hand_capsules(names[k].endswith(".L")))
+        along = ends[:, 1] - ends[:, 0]
+        lengths = np.linalg.norm(along, axis=1)
+        axes = R[:, k].transpose(0, 2, 1)
+        found.append((head[:, k, None] + ends[:, 0] @ axes, along / lengths[:, None] @ axes, lengths, radii))
+    first, axis, length_m, radii_m = zip(*found)
+    lengths = np.concatenate(length_m)
     return _Capsules(
-        bones=np.full(len(ends), b),
-        first_m=head[:, None] + ends[:, 0] @ R.transpose(0, 2, 1),
-        axis=(along / lengths[:, None]) @ R.transpose(0, 2, 1),
+        bones=np.repeat(bones[hands], [len(part) for part in length_m]),
+        first_m=np.concatenate(first, axis=1),
+        axis=np.concatenate(axis, axis=1),
         length_m=lengths,
-        radii_m=radii.astype(np.float32),
-        posed=np.ones(len(ends), dtype=bool),
+        radii_m=np.concatenate(radii_m).astype(np.float32),
+        posed=np.ones(len(lengths), dtype=bool),
     )
 
 
@@ -252,21 +282,27 @@ def _others(limb: Limb, state: BodyState) -> np.ndarray:
 
 
 def _explained_by(
-    evidence: Evidence, capsules: _Capsules, state: BodyState, width_m: float, unseen: float = 0.0, least: float = -np.inf
+    evidence: Evidence,
+    capsules: _Capsules,
+    state: BodyState,
+    width_m: float,
+    unseen: float = 0.0,
+    least: float = -np.inf,
+    fingers: _Capsules | None = None,
 ) -> np.ndarray:
-    """The first terms of (3) in N poses (N,), with a share `unseen`; a cell's area is that at the first capsule in one `state`. An upper
-    bound for poses that do not get above `least`."""
-    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
-    own = 2 * float((capsules.radii_m.mean(axis=1) * capsules.length_m).sum()) / evidence.voxel_m**2
-    rims = unseen * CELL_WEIGHT * own
+    """The first terms of (3) in N poses (N,), with a share `unseen`; with or without the `fingers`, which may be bent to a fist, whichever
+    explains more. A cell's area is that at the first capsule in one `state`. An upper bound for poses that do not get above `least`."""
     areas = [evidence.cell_area(view, state.head_m[capsules.bones[0]]) for view in evidence.cells]
-    most = max(sum(area * float((1 - share).sum()) for area, share in zip(areas, evidence.taken_cells)) - rims, 0.0)
-    above = gain + most > least
-    gain[~above] += most
-    some, cells = capsules.take(above), np.zeros(int(above.sum()))
+    parts = [capsules] if fingers is None else [capsules, fingers]
+    rims = unseen * CELL_WEIGHT * np.cumsum([part.area_m2 for part in parts]) / evidence.voxel_m**2
+    of_points = evidence.point_area * _gains(_gaps_of_points, evidence.points, parts, evidence.taken, width_m)
+    most = max(sum(area * float((1 - share).sum()) for area, share in zip(areas, evidence.taken_cells)) - rims[0], 0.0)
+    gain = of_points.max(axis=0) + most
+    above = gain > least
+    some, cells = [part.take(above) for part in parts], np.zeros((len(parts), int(above.sum())))
     for view, share, area in zip(evidence.cells, evidence.taken_cells, areas):
-        cells += area * _gain_of_cells(view, some, share, width_m)
-    gain[above] += np.maximum(cells - rims, 0.0)
+        cells += area * _gains(_gaps_of_cells, view, some, share, width_m)
+    gain[above] = (of_points[:, above] + np.maximum(cells - rims[:, None], 0.0)).max(axis=0)
     return gain
 
 
@@ -296,8 +332,9 @@ def _weight(gap: np.ndarray, width_m: float) -> np.ndarray:
     return np.asarray(1 / (1 + (gap / width_m) ** 2) ** 2)  # (1)
 
 
-def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    """(2) of points in N poses (N,), in single precision: products of matrices give what is linear in 1, X and X² of all pairs."""
+def _gaps_of_points(points: CloudPoints, capsules: _Capsules) -> np.ndarray:
+    """How far points (P,) are from capsules in N poses (N, P), in single precision: products of matrices give what is linear in 1, X and X²
+    of all pairs."""
     origin = capsules.first_m[0, 0]  # numbers are small from here
     X, normals = (v.astype(np.float32) for v in (points.xyz_m - origin, points.normals))
     along_normal = np.where(normals.any(axis=1), np.einsum("pi,pi->p", X, normals), FAR_AWAY_M)  # an unknown normal points outwards
@@ -320,14 +357,15 @@ def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray,
         facing = outwards > np.float32(FACING) * distance
         distance -= capsules.radius(k, nearest)
         np.minimum(gap, np.abs(distance, out=distance), out=gap, where=facing)
-    return _gain(gap, taken, width_m)
+    return gap
 
 
-def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    """(2) of cells in N poses (N,): places along and across the image of a capsule, the first as fractions, the others in metres."""
+def _gaps_of_cells(view: PersonCells, capsules: _Capsules) -> np.ndarray:
+    """How far cells (P,) are beyond capsules in N poses (N, P): places along and across the image of a capsule, the first as fractions, the
+    others in metres."""
     gap = np.full((len(capsules.first_m), len(view.xy_px)), np.inf, np.float32)
     if not gap.size:
-        return gap.sum(axis=1)
+        return gap
     centre = view.xy_px.mean(axis=0)
     ends_px, metres = capsules.image(view.camera)
     visible = (np.abs(ends_px) < LARGEST_PX).all(axis=(1, 3))
@@ -351,14 +389,20 @@ def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, wi
         np.sqrt(distance, out=distance)
         distance -= capsules.radius(k, nearest)
         np.minimum(gap, distance, out=gap)
-    return _gain(np.maximum(gap, _ZERO, out=gap), taken, width_m)
+    return np.maximum(gap, _ZERO, out=gap)
 
 
-def _gain(gap: np.ndarray, taken: np.ndarray, width_m: float) -> np.ndarray:
-    """The sums (N,) of (2) of one kind, of the distances (N, P) from the nearest capsule."""
-    gain = _weight(gap, width_m)
-    gain -= taken.astype(np.float32)
-    return np.asarray(np.maximum(gain, _ZERO, out=gain).sum(axis=1), dtype=np.float64)
+def _gains(
+    gaps_of: Callable[[Any, _Capsules], np.ndarray], seen: Any, parts: Sequence[_Capsules], taken: np.ndarray, width_m: float
+) -> np.ndarray:
+    """The sums (K, N) of (2) of what is seen, of the first of K parts, of the first two, …"""
+    gap, found = np.array(np.inf, np.float32), []
+    for part in parts:
+        gap = np.minimum(gap, gaps_of(seen, part))
+        gain = _weight(gap, width_m)
+        gain -= taken.astype(np.float32)
+        found.append(np.maximum(gain, _ZERO, out=gain).sum(axis=1))
+    return np.asarray(found, dtype=np.float64)
 
 
 def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others: np.ndarray) -> np.ndarray:

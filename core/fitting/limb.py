@@ -53,8 +53,9 @@ class Limb:
         return name[-1] if is_hand(name) and len(self.outer) == 1 else None
 
     def reach_m(self, lengths_m: np.ndarray) -> float:
-        """How far it reaches from where it begins, in a body with bones of these lengths (B,)."""
-        return float(lengths_m[self.outer].sum()) * (1.0 if self.hand is None else REACH)
+        """How far it reaches from where it begins, with fingers, in a body with bones of these lengths (B,)."""
+        hands = [is_hand(self.parameters.skeleton.bones[b].name) for b in self.outer]
+        return float((lengths_m[self.outer] * np.where(hands, REACH, 1.0)).sum())
 
     def poses(self, pose: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,)."""

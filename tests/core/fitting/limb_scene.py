@@ -3,13 +3,15 @@
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 
 from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.body.skin.contour_skin import limb_skin
+from tricap.core.body.skin.contour_skin import body_skin, limb_skin
+from tricap.core.fitting.hands import hand_capsules
 from tricap.core.fitting.inputs.fit_input import ViewContours
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import rasterize
@@ -33,6 +35,27 @@ def front_rig(focal_px: float = 1500.0) -> Rig:
         for name, x in zip("LCR", (-0.4, 0.0, 0.4))
     ]
     return Rig(cameras=tuple(cameras))
+
+
+def hand_places(shape: BodyShape, pose: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 3) along the axes of the capsules of a hand, "hand.L" or "hand.R", in a pose, and their radii (N,)."""
+    b = [bone.name for bone in shape.skeleton.bones].index(name)
+    R, head = bone_frames(shape.skeleton, shape.lengths_m, pose)
+    ends, radii = (part * shape.lengths_m[b] for part in hand_capsules(left=name.endswith(".L")))
+    share = np.linspace(0, 1, 12)[:, None, None]
+    along = ((1 - share) * ends[:, 0] + share * ends[:, 1]).reshape(-1, 3)
+    return head[b] + along @ R[b].T, ((1 - share[..., 0]) * radii[:, 0] + share[..., 0] * radii[:, 1]).ravel()
+
+
+def person_seen(camera: Camera, shape: BodyShape, pose: np.ndarray) -> np.ndarray:
+    """Where (h, w) a camera sees a body in a pose, with its fingers."""
+    skin = body_skin(shape, pose)
+    raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
+    person = (raster.image(np.ones(len(raster.sample)), 0.0) > 0).astype(np.uint8)
+    for places, radii in (hand_places(shape, pose, name) for name in ("hand.L", "hand.R")):
+        for at, depth, r in zip(camera.project(places), camera.to_camera(places)[:, 2], radii):
+            cv2.circle(person, tuple(at.round().astype(int).tolist()), int(r * camera.focal_px / depth), 1, -1)
+    return person > 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,9 +38,8 @@ from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.state import free_bones
 from tricap.core.foundation.progress import Monitor
-from tricap.core.geometry.raster import rasterize
 
-from .limb_scene import front_rig, measured_cloud
+from .limb_scene import front_rig, measured_cloud, person_seen
 
 STEP_PX, FRAMES = 4, 5
 SHAPE = default_shape(read_model("full"))
@@ -61,13 +60,11 @@ NOTHING = CloudPoints(frame=0, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)),
 
 def _regions(rig) -> list[BackgroundDistances]:
     """The person in the views, in all frames."""
-    skins = [body_skin(SHAPE, pose) for pose in POSES]
     found = []
     for camera in rig.cameras:
         images = []
-        for skin in skins:
-            raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
-            person = (raster.image(np.ones(len(raster.sample)), 0.0) > 0)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX]
+        for pose in POSES:
+            person = person_seen(camera, SHAPE, pose)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX]
             far = cv2.distanceTransform((~person).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
             images.append(np.minimum(far * STEP_PX / UNIT_PX, 255))
         found.append(
@@ -117,6 +114,22 @@ def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     assert misplaced(evidence, limb, state) < 1.0
     assert misplaced(evidence, limb, fit.parameters.state(_raised(60.0), vector)) > CONTRADICTED
     assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
+
+
+def test_an_arm_explains_the_fingers_of_its_hand_or_a_fist(fit) -> None:
+    limb, vector = _arm(fit), _vector(fit)
+    state = fit.parameters.state(BEFORE, vector)
+    near = fit.seen(0, NOTHING).near(limb, state)
+    wrist, knuckles = (state.joints_m[SHAPE.skeleton.joint_names.index(name)] for name in ("wrist.R", "knuckles.R"))
+    beyond = []
+    for view in near.cells:
+        first, end = view.camera.project(np.stack([knuckles + 0.2 * (knuckles - wrist), 2 * knuckles - wrist]))
+        beyond.append((view.xy_px - first) @ (end - first) > 0)
+    cells, taken = zip(*((view.take(~out), share[~out]) for view, share, out in zip(near.cells, near.taken_cells, beyond)))
+    fist = replace(near, cells=cells, taken_cells=taken)
+    fingers = near.unexplained(wrist) - fist.unexplained(wrist)
+    open_hand, closed = (limb_gains(seen, limb, BEFORE[None], vector, 0.01)[0] for seen in (near, fist))
+    assert open_hand - closed > 0.5 * fingers > 5 and closed > 0.5 * fist.unexplained(wrist)
 
 
 def test_gains_above_the_least_are_exact_and_the_others_are_not_above_it(fit) -> None:
@@ -193,7 +206,7 @@ def test_an_arm_inside_the_trunk_or_before_points_behind_it_is_misplaced(fit) ->
 def test_an_arm_without_points_is_found_by_its_silhouettes(fit) -> None:
     found = reacquired_poses(fit, 4, NOTHING, BEFORE, _vector(fit))
     true, was, now = (joint_positions(SHAPE.skeleton, SHAPE.lengths_m, m)["wrist.R"] for m in (POSES[4], BEFORE, found[-1]))
-    assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm((now - true)[[0, 2]]) < 0.08  # across the view
+    assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm((now - true)[[0, 2]]) < 0.10  # across the view
 
 
 def test_a_limb_that_tracking_lost_is_followed_through_the_frames(fit) -> None:

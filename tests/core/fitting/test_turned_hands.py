@@ -9,8 +9,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.hands import hand_capsules, is_hand, thumb_side
 from tricap.core.fitting.inputs.background import UNIT_PX
 from tricap.core.fitting.inputs.cloud_points import CloudPoints
@@ -25,9 +24,8 @@ from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.stages.turned_hands import angles_of_hands, priors_at, turn_hands
 from tricap.core.foundation.progress import Monitor
-from tricap.core.geometry.raster import rasterize
 
-from .limb_scene import front_rig, measured_cloud
+from .limb_scene import front_rig, hand_places, measured_cloud, person_seen
 
 STEP_PX, FRAMES = 4, 6
 SHAPE = default_shape(read_model("full"))
@@ -44,18 +42,9 @@ def _pose(angles: np.ndarray, lifted: float = 60.0) -> np.ndarray:
     return motion
 
 
-def _hand(pose: np.ndarray, b: int = HAND) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, 3) along the axes of a hand's capsules in a pose, and their radii (N,)."""
-    R, head = bone_frames(SHAPE.skeleton, SHAPE.lengths_m, pose)
-    ends, radii = (part * SHAPE.lengths_m[b] for part in hand_capsules(left=b == LEFT))
-    share = np.linspace(0, 1, 12)[:, None, None]
-    along = ((1 - share) * ends[:, 0] + share * ends[:, 1]).reshape(-1, 3)
-    return head[b] + along @ R[b].T, ((1 - share[..., 0]) * radii[:, 0] + share[..., 0] * radii[:, 1]).ravel()
-
-
 def _points(pose: np.ndarray) -> CloudPoints:
     """Points on the hand that the cameras see."""
-    places, radii = _hand(pose)
+    places, radii = hand_places(SHAPE, pose, "hand.R")
     turn = np.random.default_rng(1).normal(size=(3, *places.shape))
     normals = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
     normals[..., 1] = -np.abs(normals[..., 1])
@@ -64,14 +53,10 @@ def _points(pose: np.ndarray) -> CloudPoints:
 
 
 def _regions(rig, pose: np.ndarray) -> list[BackgroundDistances]:
-    skin, found = body_skin(SHAPE, pose), []
-    places, radii = (np.concatenate(parts) for parts in zip(_hand(pose), _hand(pose, LEFT)))
+    found = []
     for camera in rig.cameras:
-        raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
-        person = (raster.image(np.ones(len(raster.sample)), 0.0) > 0).astype(np.uint8)
-        for at, depth, r in zip(camera.project(places), camera.to_camera(places)[:, 2], radii):
-            cv2.circle(person, tuple(at.round().astype(int).tolist()), int(r * camera.focal_px / depth), 1, -1)
-        far = cv2.distanceTransform(1 - person[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX], cv2.DIST_L2, cv2.DIST_MASK_5)
+        person = person_seen(camera, SHAPE, pose)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX]
+        far = cv2.distanceTransform((~person).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         images = [np.minimum(far * STEP_PX / UNIT_PX, 255)] * FRAMES
         found.append(
             BackgroundDistances(view=camera.name, frame=np.arange(FRAMES), distance=Packed(images), step_px=STEP_PX, unit_px=UNIT_PX)
