@@ -28,6 +28,7 @@ from ...core.motion.digits import with_digits
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
 from ...core.results.folder import check_inside
+from ...core.results.outputs import check_replaceable
 from ..scene import skin
 from . import playing, programs
 from .build import build_armature
@@ -36,6 +37,8 @@ from .programs import Program, bone_names
 
 FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
 UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
+USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+USD_STARTS = ("PXR-USDC", "#usda", "PK\3\4")
 NO_MESHES = "Alembic stores meshes, and this motion has none; choose fbx, glb or usd."
 LEAST_FREE_MB, LEFT_MB = 32, 1  # of the disk: before an export, and after it; USD and Alembic do not notice that it is full
 TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "images", "collections")
@@ -216,10 +219,31 @@ def _usd(path: str, program: Program) -> None:
             export_global_up_selection=UP[axes],
             convert_scene_units=unit,
         )
-        for picture in (Path(folder) / textures.name).glob("*"):
+        pictures = list((Path(folder) / textures.name).glob("*"))
+        for picture in pictures:
+            _check_earlier(textures / picture.name)
+        for picture in pictures:
             textures.mkdir(exist_ok=True)
             os.replace(picture, textures / picture.name)
         os.replace(file, path)
+
+
+def _check_earlier(picture: Path) -> None:
+    """Check that a picture with a name that is given to one of an exported file (`own_textures`) is of an earlier export into that file.
+
+    Raises:
+        InputError: it is the user's.
+    """
+    exported = picture.parent.parent / picture.name.rpartition("_")[0]
+    if exported.suffix.lower() not in USD_ENDINGS or not picture.exists() or picture.is_symlink():
+        return
+    try:
+        check_replaceable(exported, *USD_STARTS)
+        earlier = exported.exists()
+    except InputError:
+        earlier = False
+    if not earlier:
+        raise InputError(f"{picture} would be overwritten, and is not of an earlier export; rename it, or choose another name.")
 
 
 def _abc(path: str, program: Program) -> None:

@@ -24,6 +24,7 @@ from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
 from ...core.results import blend_file
 from ...core.results.folder import FIELDS
+from ...core.results.outputs import check_replaceable
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
 from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, stored, surroundings
@@ -71,6 +72,8 @@ def write_scene(
     """The second half of `build_scene`: main thread only. Everything that can fail comes before the removal of an earlier build."""
     if options.exact_skin and blend is None:
         raise InputError("The exact skin is saved next to the Blender file; give the Blender file a name.")
+    if options.exact_skin and blend is not None:
+        check_replaceable(skin.cache_of(blend), skin.PC2_START)
     scene = bpy.context.scene
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -416,7 +419,7 @@ def _add_body(
         if stand is not None:
             skin_object.data.transform(Matrix.Translation((0.0, 0.0, stand.lift_m)))
         if contents.skins is not None and blend is not None:
-            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, real_place(blend).with_suffix(".pc2"))
+            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, skin.cache_of(blend))
             counts["exact skin faces"] = len(shown.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")

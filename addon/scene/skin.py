@@ -27,6 +27,7 @@ from ...core.body.skin.person_skin import REST, read_skin, resampled, rest_skin
 from ...core.body.skin.posed import Poser
 from ...core.body.skin.whole_surface import field_grid
 from ...core.foundation import store
+from ...core.foundation.bounded import real_place
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
@@ -40,6 +41,7 @@ CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 WEIGHT_STEPS = 2000  # quantisation of the weights; coarser ones fold the inside of a sharply bent elbow
 IMPLICIT_SPACING_M = 0.005  # of the grid in which the implicit surface is sampled; the surface is then exact to 0.4 mm
+PC2_START = "POINTCACHE2"
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
@@ -90,6 +92,11 @@ def in_rest_pose(skin: OneSkin, made: BodyShape, shape: BodyShape) -> OneSkin:
     return replace(skin, vertices_m=Poser(made, skin.weights).moved(skin.vertices_m, *rest)[0])
 
 
+def cache_of(blend: Path) -> Path:
+    """The file of the exact skin of a .blend file."""
+    return real_place(blend).with_suffix(".pc2")
+
+
 def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:
     """The skin cast in every frame. Writes `cache` (.pc2); missing frames repeat the previous skin.
 
@@ -99,7 +106,7 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
     rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), skins.settings)
     first, last = int(skins.frames[0]), int(skins.frames[-1])
     row_of_frame = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
-    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(row_of_frame))
+    head = PC2_HEADER.pack(f"{PC2_START}\0".encode(), 1, len(rest.vertices_m), float(first), 1.0, len(row_of_frame))
     store.write_bytes(cache, head + skins.vertices_m[row_of_frame].tobytes())
     skin_object = _mesh_object(collection, EXACT_NAME, rest.vertices_m, rest.faces, corner_uv(rest))
     if len(rest.part_sizes) > 1:  # where parts overlap, shade by the surface they share

@@ -21,6 +21,7 @@ def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -
     checks.append(lambda: _silhouettes_of_first(footage))
     findings = list[Finding]()
     for check in checks:
+        monitor.check()
         try:
             check()
         except InputError as error:

@@ -23,6 +23,7 @@ RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor
 INLIER_PX = 2.0  # distance from a fundamental matrix
 MINIMAL_MATCHES = 7  # that a fundamental matrix always fits
 INLIER_SHARE = 0.6  # of the other matches
+NEIGHBOURS = 6  # views ahead with which a view is matched: in time linear in the views
 FEWEST_MATCHES = 24  # distinct ones, of a pair
 DEEPER = 1.01  # factor of a depth, to find in which direction its point moves in another view
 
@@ -175,14 +176,14 @@ def _along_px(a: Camera, b: Camera, c: Camera, xa_px: np.ndarray, xb_px: np.ndar
 
 
 def match_views(images: Sequence[Sequence[np.ndarray]], rows: RowGrid) -> list[PairMatches]:
-    """The matches of every pair of views over some frames; `images[t][k]` are the measured rows of view k."""
+    """The matches of pairs of views over some frames; `images[t][k]` are the measured rows of view k."""
     return match_features([[find_features(image) for image in frame] for frame in images], rows)
 
 
 def match_features(features: Sequence[Sequence[Features]], rows: RowGrid) -> list[PairMatches]:
-    """The matches of every pair of views over some frames; `features[t][k]` are those of view k."""
+    """The matches of every pair of views that are near each other in the list, over some frames; `features[t][k]` are those of view k."""
     pairs = []
-    for i, j in combinations(range(len(features[0])), 2):
+    for i, j in ((i, j) for i, j in combinations(range(len(features[0])), 2) if j - i <= NEIGHBOURS):
         matched = [match_pair(frame[i], frame[j]) for frame in features]
         xi = np.concatenate([frame[i].xy[m] for frame, (m, _) in zip(features, matched)])
         xj = np.concatenate([frame[j].xy[m] for frame, (_, m) in zip(features, matched)])

@@ -104,7 +104,8 @@ def check_outputs(args: argparse.Namespace) -> None:
     names = (*OUTPUTS, "out") if args.command in WITH_OUT else OUTPUTS
     values = {name: value for name, value in vars(args).items() if name not in args.words}
     results = args.out if args.command in WITH_RESULTS else None
-    outputs.check_outputs(values, names, may_be_rig=args.command == "calibrate", results=results)
+    is_rig = args.command == "calibrate" and args.format is None  # another tool's file would make a take unreadable
+    outputs.check_outputs(values, names, may_be_rig=is_rig, results=results)
 
 
 def check_simplify(degrees: float) -> None:

@@ -42,6 +42,7 @@ MARKED = (
     "ffmpeg -i {name} -vf setfield=prog -c:v ffv1 new.mkv"
 )
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
+OTHER_SIZE = "{path} has {w}×{h} pixels, but its camera has {size[0]}×{size[1]}; use the footage as it was calibrated."
 WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
 
@@ -70,8 +71,9 @@ class ImageSequence(Protocol):
 class ImageFiles:
     """Numbered image files in natural order (2 before 10)."""
 
-    def __init__(self, paths: tuple[Path, ...], source: str) -> None:
-        self._paths, self._source = paths, source
+    def __init__(self, paths: tuple[Path, ...], source: str, size_px: tuple[int, int] | None = None) -> None:
+        """`size_px`: (width, height) of its camera's images; those of another size are not decoded."""
+        self._paths, self._source, self._size_px = paths, source, size_px
         self._top: float | None = None
 
     @property
@@ -94,21 +96,21 @@ class ImageFiles:
         Raises:
             InputError: the file is gone or is not an image.
         """
-        return read_image(self._paths[index], self._white())
+        return grey(decoded(self._paths[index], self._size_px), self._white())
 
     def read_colour(self, index: int) -> np.ndarray:
         """RGB values (h, w, 3) float32 of file `index`; see `read`."""
-        return colour(decoded(self._paths[index]), self._white())
+        return colour(decoded(self._paths[index], self._size_px), self._white())
 
     def _white(self) -> float:
         """The grey value of white: cameras of 10 or 12 bits often write files of 16 bits."""
         if self._top is None:
             samples = sorted({0, len(self._paths) // 2, len(self._paths) - 1})
-            first = decoded(self._paths[0])
+            first = decoded(self._paths[0], self._size_px)
             if first.dtype != np.uint16:
                 self._top = 0.0
             else:
-                brightest = max(int(decoded(self._paths[i]).max()) for i in samples)
+                brightest = max(int(decoded(self._paths[i], self._size_px).max()) for i in samples)
                 self._top = float(next(white for white in WHITES if brightest <= white))
         return self._top
 
@@ -150,7 +152,12 @@ class LaterPart:
 class Movie:
     """A movie file, decoded frame by frame; reading in order is fast, reading backwards starts again."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, size_px: tuple[int, int] | None = None) -> None:
+        """`size_px`: (width, height) of its camera's images; a movie of another size is not decoded.
+
+        Raises:
+            InputError: it is no movie that can be decoded, too large, or of another size.
+        """
         _check_movie(path)
         self._path = path
         self._capture = _capture(path)
@@ -162,6 +169,8 @@ class Movie:
             raise InputError(NO_MOVIE.format(path=path))
         w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         _refuse_size((w, h), path)
+        if size_px is not None and (w, h) not in (size_px, size_px[::-1]):
+            raise InputError(OTHER_SIZE.format(path=path, w=w, h=h, size=size_px))
         self._count = count
         self._packets.at(0)
         if self._packets.may_be_interlaced and count > 1:
@@ -266,11 +275,13 @@ def _capture(path: Path) -> Any:
     return capture
 
 
-def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str, gaps: bool = False) -> ImageSequence:
-    """The sequence of one view of the take in `folder`. `gaps`: numbers may be missing among its images.
+def open_sequence(
+    folder: Path, *, images: str | None, movie: str | None, view: str, gaps: bool = False, size_px: tuple[int, int] | None = None
+) -> ImageSequence:
+    """The sequence of one view of the take in `folder`. `gaps`: numbers may be missing among its images; `size_px` of its camera.
 
     Raises:
-        InputError: there is no such footage, or a path leads out of the folder.
+        InputError: there is no such footage, it is a movie of another size, or a path leads out of the folder.
     """
     pattern = images if images is not None else movie or ""
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
@@ -284,7 +295,7 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         path = folder / movie
         if not path.is_file():
             raise InputError(f"The movie {path} of view {view} is missing; correct `movie` in take.toml.")
-        return Movie(path)
+        return Movie(path, size_px)
     found = bounded.matching(folder, pattern)
     paths = tuple(sorted((p for p in found if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
     if not paths:
@@ -296,7 +307,7 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         _check_numbering(paths, view)
     for path in paths:
         _check_signature(path)
-    return ImageFiles(paths, pattern)
+    return ImageFiles(paths, pattern, size_px)
 
 
 def read_image(path: Path, white: float = 0.0) -> np.ndarray:
@@ -308,19 +319,18 @@ def read_image(path: Path, white: float = 0.0) -> np.ndarray:
     return grey(decoded(path), white)
 
 
-def decoded(path: Path) -> np.ndarray:
+def decoded(path: Path, size_px: tuple[int, int] | None = None) -> np.ndarray:
     """The pixels of an image file (h, w) or (h, w, channels).
 
     Raises:
-        InputError: the file is missing, is not an image, has several, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type
-            of pixels.
+        InputError: the file is missing, is not an image, has several, is too large (MAX_PIXELS, MAX_SIDE_PX), has another size (width,
+            height) than `size_px`, or an unsupported type of pixels.
     """
-    try:
-        content = bounded.bytes_of(path, bounded.IMAGE_BYTES)
-    except OSError as error:
-        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
-    _refuse_open_exr(content[:8], path)
-    _refuse_size(claimed_size(content), path)
+    content = _content(path)
+    claimed = claimed_size(content)
+    _refuse_size(claimed, path)
+    if claimed is not None and size_px is not None and claimed not in (size_px, size_px[::-1]):  # a photograph may say that it is turned
+        raise InputError(OTHER_SIZE.format(path=path, w=claimed[0], h=claimed[1], size=size_px))
     if has_several_images(content):
         raise InputError(f"{path} has several images, of which only one would be measured; write each of them to a file of its own.")
     try:
@@ -333,6 +343,24 @@ def decoded(path: Path) -> np.ndarray:
     if image.dtype.name not in KINDS:
         raise InputError(f"{path} has {image.dtype.name} pixels; save it with 8 or 16 bits per channel.")
     return np.asarray(image)
+
+
+def header_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) in the header of an image file, None if it is damaged; nothing is decoded.
+
+    Raises:
+        InputError: the file is missing, or an OpenEXR image.
+    """
+    return claimed_size(_content(path))
+
+
+def _content(path: Path) -> bytes:
+    try:
+        content = bounded.bytes_of(path, bounded.IMAGE_BYTES)
+    except OSError as error:
+        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    _refuse_open_exr(content[:8], path)
+    return content
 
 
 def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:

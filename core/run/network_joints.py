@@ -24,11 +24,13 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.intersection import doubtful_view, intersect_clicks, joint_clicks_contradict
 from ..networks.pose_network import PoseNetwork
+from ..results.outputs import check_replaceable
 from ..take.footage import Footage
 from ..take.writing import read_table, write_table
 from .network_process import open_network
 
 FOLDER, ENDING = "keypoints", ".network.json"  # in the take's folder
+COCO_START = '{"categories": [{"id": 1, "name": "person"'  # of `_coco`
 SIGMA_OF_HEIGHT, LEAST_SIGMA_PX = 0.02, 2.0  # of a confident point, about the person's height: 35 mm of a person of 1.75 m
 LEAST_HEIGHT = 0.15  # of the image's, of a region that may be the person
 OVERLAP = 0.7  # of two boxes, below which the network looks again
@@ -159,17 +161,18 @@ def write_network_joints(folder: Path, joints: NetworkJoints) -> list[Path]:
     """Write keypoints/VIEW.network.json in a take's folder and name them under [[keypoints]] in its take.toml; other entries stay.
 
     Raises:
-        InputError: something cannot be written; take.toml is unchanged then.
+        InputError: something cannot be written, or a file that is not of an earlier call is there; take.toml is unchanged then.
     """
     target = folder / FOLDER
     if real_path(target).parent != real_path(folder):
         raise InputError(f"{target} leads out of the take's folder; remove that link.")
-    paths = list[Path]()
+    paths = [target / f"{view}{ENDING}" for view in joints.views]
+    for path in paths:
+        check_replaceable(path, COCO_START)
     try:
         target.mkdir(exist_ok=True)
-        for k, view in enumerate(joints.views):
-            paths.append(target / f"{view}{ENDING}")
-            store.write_text(paths[-1], _coco(joints, k))
+        for k, path in enumerate(paths):
+            store.write_text(path, _coco(joints, k))
     except OSError as error:
         raise InputError(f"Cannot write into {target}: {error.strerror or error}.") from error
     own = {f"{FOLDER}/{glob.escape(path.name)}": k for k, path in enumerate(paths)}

@@ -20,6 +20,7 @@ import numpy as np
 from ..checking.timing import TimeOffset, estimate_offsets
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..geometry.rig import read_rig
 from ..images.sequence import ImageSequence, open_sequence
 from ..take.clock import Clock, clocks_of
 from ..take.footage import Footage, open_take
@@ -213,7 +214,8 @@ def _unplaced(view: View) -> View:
 
 def _timed(take: Take, view: View) -> tuple[ImageSequence, Clock]:
     """The images of a view, and its clock."""
-    sequence = open_sequence(take.folder, images=view.images, movie=view.movie, view=view.name)
+    size_px = read_rig(take.rig_path)[view.name].size_px if take.rig_path.is_file() else None
+    sequence = open_sequence(take.folder, images=view.images, movie=view.movie, view=view.name, size_px=size_px)
     timed = replace(take, views=(replace(view, fps=view.fps or _rate(take)),))
     return sequence, clocks_of(timed, (sequence,))[0]
 
@@ -245,8 +247,6 @@ def _rate(take: Take) -> float:
 def _distance_m(take: Take, view: View) -> float:
     if not take.rig_path.is_file():
         return USUAL_DISTANCE_M
-    from ..geometry.rig import read_rig
-
     rig = read_rig(take.rig_path)
     return float(np.linalg.norm(rig[view.name].centre_m - rig[take.reference_view].centre_m))
 

@@ -193,7 +193,9 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
     rig = read_rig(take.rig_path)
     rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata, remarks=rig.remarks)
     take = take if take.reference_chosen else replace(take, reference_view=default_reference([v.name for v in take.views], rig))
-    sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
+    sequences = sequences or tuple(
+        open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name, size_px=rig[v.name].size_px) for v in take.views
+    )
     frames, clocks = footage_frames(take, sequences), clocks_of(take, sequences)
     if clocks:
         sequences = tuple(s if isinstance(s, Recent) else Recent(s) for s in sequences)  # read with their neighbours in time

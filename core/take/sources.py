@@ -17,7 +17,7 @@ import numpy as np
 from ..foundation import bounded
 from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
-from ..images.sequence import read_image
+from ..images.sequence import header_size, read_image
 
 
 def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
@@ -106,10 +106,13 @@ def read_picture(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
     Raises:
         InputError: it cannot be read, or is of another size than the view.
     """
-    image = read_image(path)
-    if image.shape[::-1] != size_px:
-        size = f"{image.shape[1]}×{image.shape[0]} pixels, the view {size_px[0]}×{size_px[1]}"
-        raise InputError(f"{path} of view {view} has {size}; make it the size of the view.")
+    size = header_size(path)
+    if size is None or size in (size_px, size_px[::-1]):
+        image = read_image(path)
+        size = image.shape[1], image.shape[0]
+    if size != size_px:
+        sizes = f"{size[0]}×{size[1]} pixels, the view {size_px[0]}×{size_px[1]}"
+        raise InputError(f"{path} of view {view} has {sizes}; make it the size of the view.")
     return image
 
 
@@ -127,6 +130,7 @@ def person_files(folder: Path, view: str, kind: str, picture: Path) -> tuple[str
 
 
 LARGEST_PX = 1e6  # of a click
+MOST_TABLES = 200  # of keypoints: as many as views
 LEAST_SIGMA, LARGEST_SIGMA = 1e-4, 1e4  # px, or m in space: beyond, the weights leave the range of numbers
 KEYS = ("files", "view", "offset_frames", "sigma", "names", "axes")
 PIXELS = (".json",)  # files of keypoints in pixels
@@ -153,9 +157,15 @@ def keypoint_sources(
     """The keypoint sources of a take.toml.
 
     Raises:
-        InputError: a key, view or joint is unknown, or a value is impossible.
+        InputError: a key, view or joint is unknown, a value is impossible, or there are very many tables, or two of the same files.
     """
-    return tuple(_source(table, views, joints, f"[[keypoints]] of {where}") for table in tables)
+    if len(tables) > MOST_TABLES:
+        raise InputError(f"{where} has {len(tables)} tables [[keypoints]]; {MOST_TABLES} is the most. One pattern can name many files.")
+    found = tuple(_source(table, views, joints, f"[[keypoints]] of {where}") for table in tables)
+    named = [(source.files, source.view) for source in found]
+    if twice := next((one for n, one in enumerate(named) if one in named[:n]), None):
+        raise InputError(f"Two tables [[keypoints]] of {where} name the files “{twice[0]}” for the same view; remove one of them.")
+    return found
 
 
 def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str], where: str) -> KeypointSource:

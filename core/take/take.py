@@ -298,6 +298,9 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         raise InputError(f"{where} has {len(views)} views; a take has at most {MOST_CAMERAS}.")
     if len({v.name.casefold() for v in views}) < len(views):
         raise InputError(f"Two views of {where} have the same name, or names that differ only in capitals; give each its own.")
+    footage = {(v.images, v.movie): v.name for v in reversed(views)}
+    if same := next((v.name for v in views if footage[v.images, v.movie] != v.name), None):
+        raise InputError(f"View {same} of {where} has the footage of another view; give it that of its own camera.")
     return tuple(views)
 
 

@@ -24,12 +24,19 @@ CLICK_REACH_PX = 5.0  # distance from a click to the trajectory that it means
 
 def inside_polygon(xy: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     """Which points (N, 2) lie inside a polygon (V, 2), by the even–odd rule; NaN lies outside."""
-    a, b = polygon[None], np.roll(polygon, -1, axis=0)[None]
-    x, y = xy[:, None, 0], xy[:, None, 1]
-    crosses = (a[..., 1] > y) != (b[..., 1] > y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = a[..., 0] + (y - a[..., 1]) * (b[..., 0] - a[..., 0]) / (b[..., 1] - a[..., 1])
-        return ((crosses & (x < at)).sum(axis=1) % 2 == 1) & np.isfinite(xy).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero(((xy >= polygon.min(axis=0)) & (xy <= polygon.max(axis=0))).all(axis=1))
+    rows = rows[np.argsort(xy[rows, 1], kind="stable")]
+    x, y = xy[rows].T
+    inside = np.zeros(len(rows), dtype=bool)
+    ends = np.roll(polygon, -1, axis=0)
+    first, last = (np.searchsorted(y, edge(polygon[:, 1], ends[:, 1])) for edge in (np.minimum, np.maximum))
+    for k in np.flatnonzero(last > first).tolist():  # the points beside each side
+        (ax, ay), (bx, by), beside = polygon[k], ends[k], slice(first[k], last[k])
+        inside[beside] ^= x[beside] < ax + (y[beside] - ay) * (bx - ax) / (by - ay)
+    found = np.zeros(len(xy), dtype=bool)
+    found[rows] = inside
+    return found
 
 
 def in_region(raw: Trajectories, camera: Camera, polygon: np.ndarray, frames: range) -> np.ndarray:

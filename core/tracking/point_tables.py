@@ -22,6 +22,7 @@ from .settings import TrackStatus
 MOST_CORNERS = 1000  # of a polygon, as in take.toml
 FARTHEST_PX = 1e6  # of a corner, as in take.toml
 SMALLEST_PX2 = 1.0  # area of a polygon
+MOST_POINTS = 10_000
 MOST_VERTICES = 4000  # of the outline that starts from a polygon: its fit needs memory by their square
 MAX_COMPARED = 1000  # names among which the nearest to a misspelt one is searched
 
@@ -57,6 +58,8 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
             raise InputError(f"{path} has no column “{name}”; the columns are {', '.join(needed)}: {hint}.")
     xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
     names = tuple((row["point"] or "").strip() for row in rows)
+    if len(rows) > MOST_POINTS:
+        raise InputError(f"{path} has {len(rows)} points; {MOST_POINTS} is the most that are followed at once.")
     views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
     if "" in names or len(set(zip(names, views))) < len(names):
         raise InputError(f"{path} names a point twice or not at all; give every point its own name.")

@@ -1,6 +1,7 @@
 """What a user may want otherwise: exact skin, T-pose, fewer keys, colours, arrows, pictures."""
 
 import os
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -47,6 +48,10 @@ def test_exact_skins_replace_no_file_of_another_scene(small_run: SmallRun, tmp_p
     (tmp_path / "b.pc2").write_text("mine")
     assert main(["scene", str(small_run.out), "--blend", str(tmp_path / "b.blend"), "--exact-skin"]) == 2
     assert "would overwrite" in capfd.readouterr().err and (tmp_path / "b.pc2").read_text() == "mine"
+    shutil.copytree(small_run.out, tmp_path / "copied")
+    (tmp_path / "b.blend").write_text("another file of that name")
+    assert main(["scene", str(tmp_path / "copied"), "--blend", str(tmp_path / "b.blend"), "--exact-skin"]) == 2
+    assert "not of an earlier call" in capfd.readouterr().err and (tmp_path / "b.pc2").read_text() == "mine"
 
 
 def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
@@ -181,6 +186,13 @@ def test_the_colours_of_a_usd_file_replace_others_and_stay_in_its_folder(empty: 
     assert cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), 200, np.uint8))
     export_file(small_run.out, "usd", out / "b.usd", "plain", Monitor())
     assert (out / "textures" / "a.usd_1.png").read_bytes() == first != (out / "textures" / "b.usd_1.png").read_bytes()
+    export_file(small_run.out, "usd", out / "a.usd", "plain", Monitor())
+    assert (out / "textures" / "a.usd_1.png").read_bytes() != first  # of an earlier export into this file
+    (out / "a.usd").write_text("a note")
+    (out / "textures" / "a.usd_1.png").write_text("mine")
+    with pytest.raises(InputError, match="a.usd_1.png would be overwritten, and is not of an earlier export"):
+        export_file(small_run.out, "usd", out / "a.usd", "plain", Monitor())
+    assert (out / "a.usd").read_text() == "a note" and (out / "textures" / "a.usd_1.png").read_text() == "mine"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "textures").symlink_to(elsewhere)
     with pytest.raises(InputError, match="textures is a link to a place outside"):

@@ -11,11 +11,12 @@ import pytest
 from tricap.core.checking.rig_check import clicked_pairs, rig_findings, stale_finding
 from tricap.core.checking.take_check import check_take
 from tricap.core.checking.timing import _fit, _Tracked
-from tricap.core.checking.view_matches import PairMatches
+from tricap.core.checking.view_matches import NEIGHBOURS, Features, PairMatches, match_features
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.images.interlace import RowGrid
 from tricap.core.take.take import FrameClicks, Take, View
 from tricap.core.take.writing import new_table, toml_text
 
@@ -164,3 +165,10 @@ def causes(folder: Path, subject: str, calibration: int, *, turn: tuple[float, f
             shutil.copy(still, folder / view / f"{n}.jpg")
     (folder / "take.toml").write_text(toml_text(new_table([{"name": v, "images": f"{v}/*.jpg"} for v in "LCR"])))
     return {finding.cause for finding in check_take(folder, Monitor()).findings}
+
+
+def test_views_are_matched_with_those_next_to_them() -> None:
+    """Forty views would be 780 pairs."""
+    nothing = Features(xy=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.float32))
+    pairs = [(p.i, p.j) for p in match_features([[nothing] * 40], RowGrid())]
+    assert len(pairs) == sum(min(NEIGHBOURS, 39 - i) for i in range(40)) and all(0 < j - i <= NEIGHBOURS for i, j in pairs)

@@ -226,6 +226,7 @@ OUTPUTS = {
     "the footage": ["calibrate", "--import", "{rig}", "--export", "openptv", "--out", "{take}/L"],
     "the images that are tracked": ["track2d", "{frames}", "--points", "{points}", "--out", "{frames}/0001.png"],
     "the pictures": ["track2d", "{frames}", "--points", "{points}", "--out", "{new}", "--pictures", "{take}/C"],
+    "a take's rig, for another tool": ["calibrate", "--import", "{rig}", "--export", "opencv", "--out", "{take}/rig.toml"],
     "its own input": ["calibrate", "--import", "{rig}", "--out", "{rig}"],
     "another input": ["calibrate", "--import", "{take}/rig.toml", "--like", "{rig}", "--out", "{rig}"],
     "a plot": ["fields", "--out", "{take}/take.toml"],

@@ -152,3 +152,9 @@ def test_a_link_out_of_the_take_is_not_followed(take: Path, footage: Footage, tm
     with pytest.raises(InputError, match="leads out of the take's folder"):
         write_network_joints(folder, found)
     assert not list(outside.iterdir())
+    (folder / "keypoints").unlink()
+    (folder / "keypoints").mkdir()
+    (folder / "keypoints" / "C.network.json").write_text("mine")
+    with pytest.raises(InputError, match="C.network.json would be overwritten"):
+        write_network_joints(folder, found)
+    assert [path.read_text() for path in (folder / "keypoints").iterdir()] == ["mine"]

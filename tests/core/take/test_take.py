@@ -159,6 +159,7 @@ FAULTS = {
     "view with a blank at its end": (text(views=VIEWS + '[[views]]\nname = "side "\nimages = "x"\n'), "that no file may have"),
     "two views alike but for capitals": (text(views=VIEWS + '[[views]]\nname = "l"\nimages = "x"\n'), "differ only in capitals"),
     "very many views": (text(views="".join(f'[[views]]\nname = "{n}"\nimages = "x"\n' for n in range(201))), "has 201 views; a take has"),
+    "two views of one footage": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = "L/*.png"\n'), "View X of .* footage of another view"),
     "two views alike": (text(views=VIEWS + '[[views]]\nname = "L"\nimages = "x"\n'), "Two views of .* have the same name"),
     "offset": (text(views=VIEWS + "offset_frames = 0.5\n"), "`offset_frames` of view .* write a whole number of frames"),
     "view without footage": (text(views=VIEWS + '[[views]]\nname = "X"\n'), "needs either `images`"),
@@ -172,6 +173,11 @@ FAULTS = {
         "`axes` of the .*kp/.* is for files in space, and these are of pixels; remove it",
     ),
     "keypoints at any depth twice": (text(more='[[keypoints]]\nfiles = "**/**/*.json"\nview = "C"\n'), "with more than one"),
+    "keypoints twice": (
+        text(more='[[keypoints]]\nfiles = "kp/*.json"\nview = "C"\n' * 2),
+        "files “kp/\\*.json” for the same",
+    ),
+    "very many keypoints": (text(more='[[keypoints]]\nfiles = "kp/*.json"\nview = "C"\n' * 201), "has 201 tables ..keypoints..; 200 is"),
     "body a word": (text(dict(body='"arm.R"')), "\\[body\\] of .* must be a table"),
     "model a number": (text(more="[body]\nmodel = 3\n"), "`model` under \\[body\\] of .* is 3"),
     "seeds a word": (text(dict(seeds='"x"')), "\\[seeds\\] of .* must be a table"),
@@ -324,6 +330,16 @@ def test_images_of_another_size_than_the_camera(footage: Path) -> None:
     assert len(opened.read(2)) == 3
     with pytest.raises(InputError, match="Frame 3 of view C has 30×40 pixels, but its camera in rig.toml has 40×30"):
         opened.read(3)
+
+
+def test_images_of_another_size_are_not_decoded(footage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """280 kB of 6000×6000 pixels took 900 MB to say so."""
+    opened = open_take(rewrite(footage))
+    assert len(opened.read(2)) == 3
+    (footage / "C" / "0003.png").write_bytes(cv2.imencode(".png", np.zeros((60, 60), np.uint8))[1].tobytes())
+    monkeypatch.setattr(cv2, "imdecode", lambda *a: pytest.fail("decoded"))
+    with pytest.raises(InputError, match="0003.png has 60×60 pixels, but its camera has 40×30"):
+        opened.sequences[1].read(3)
 
 
 def test_a_text_file_named_png(footage: Path) -> None:

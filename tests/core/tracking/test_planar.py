@@ -148,6 +148,9 @@ def test_files_that_are_no_tables(tmp_path: Path) -> None:
             read_polygon(path)
         with pytest.raises(InputError):
             read_points(path)
+    path.write_text("point,x,y\n" + "".join(f"p{i},1,2\n" for i in range(10_001)), encoding="utf-8")
+    with pytest.raises(InputError, match="has 10001 points; 10000 is the most"):
+        read_points(path)
     path.write_text("x,y,point\n1,2\n", encoding="utf-8")
     with pytest.raises(InputError, match="not at all"):
         read_points(path)
