@@ -15,7 +15,7 @@ import numpy as np
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera, image_of, interior_of
-from ...core.images.sequence import decoded
+from ...core.images.picture import decoded
 from . import cloud, surroundings, trajectories
 from .contents import Contents
 

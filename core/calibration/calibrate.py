@@ -16,7 +16,8 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
-from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart, read_image
+from ..images.picture import read_image
+from ..images.sequence import IMAGE_ENDINGS, ImageSequence, LaterPart
 from ..results.listed_files import PICTURES, check_files
 from ..results.outputs import check_replaceable
 from . import report, verdict

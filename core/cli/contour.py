@@ -6,7 +6,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import nearest_name
 from ..geometry.rig import read_rig
-from ..images.sequence import read_image
+from ..images.picture import read_image
 from ..results.outputs import check_replaceable
 from ..run import pipeline, take_run
 from ..run.outlines import MEASURED_SURFACE, Start, write_contour

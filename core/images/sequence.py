@@ -1,7 +1,6 @@
 """Image sequences of a camera: image files or a movie, with grey values as float32 in the range 0…255.
 
-Files are read on demand, so a long sequence needs no more memory than a short one. The size of an image is read from its header before
-it is decoded.
+Files are read on demand, so a long sequence needs no more memory than a short one.
 """
 
 import re
@@ -14,13 +13,11 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.errors import InputError
-from .headers import claimed_size, has_several_images
 from .packets import Packets
+from .picture import OTHER_SIZE, WHITES, colour, decoded, grey, refuse_open_exr, refuse_size
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
-MAX_PIXELS = 36_000_000  # of 8K video
-MAX_SIDE_PX = 8191  # OpenCV looks up four times as many
 SIGNATURES = (
     b"\x89PNG\r\n\x1a\n",
     b"\xff\xd8\xff",
@@ -34,7 +31,6 @@ SIGNATURES = (
     b"P5",
     b"P6",
 )
-OPEN_EXR = b"\x76\x2f\x31\x01"
 MOVIE_SIGNATURES = (b"RIFF", b"\x1a\x45\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"\x47")  # AVI, Matroska, MPEG: program, video, transport
 MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # one of them begins an MP4 or QuickTime file
 MARKED = (
@@ -42,9 +38,6 @@ MARKED = (
     "ffmpeg -i {name} -vf setfield=prog -c:v ffv1 new.mkv"
 )
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
-OTHER_SIZE = "{path} has {w}×{h} pixels, but its camera has {size[0]}×{size[1]}; use the footage as it was calibrated."
-WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
-KINDS = ("uint8", "uint16", "float32", "float64")
 
 
 class ImageSequence(Protocol):
@@ -168,8 +161,8 @@ class Movie:
         if count < 1:
             raise InputError(NO_MOVIE.format(path=path))
         w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        _refuse_size((w, h), path)
-        if size_px is not None and (w, h) not in (size_px, size_px[::-1]):
+        refuse_size((w, h), path)
+        if size_px is not None and (w, h) not in (size_px, size_px[::-1]):  # some decoders tell the size before it is turned
             raise InputError(OTHER_SIZE.format(path=path, w=w, h=h, size=size_px))
         self._count = count
         self._packets.at(0)
@@ -310,86 +303,6 @@ def open_sequence(
     return ImageFiles(paths, pattern, size_px)
 
 
-def read_image(path: Path, white: float = 0.0) -> np.ndarray:
-    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour; `white` of 16 bits if it is not 65535.
-
-    Raises:
-        InputError: see `decoded`.
-    """
-    return grey(decoded(path), white)
-
-
-def decoded(path: Path, size_px: tuple[int, int] | None = None) -> np.ndarray:
-    """The pixels of an image file (h, w) or (h, w, channels).
-
-    Raises:
-        InputError: the file is missing, is not an image, has several, is too large (MAX_PIXELS, MAX_SIDE_PX), has another size (width,
-            height) than `size_px`, or an unsupported type of pixels.
-    """
-    content = _content(path)
-    claimed = claimed_size(content)
-    _refuse_size(claimed, path)
-    if claimed is not None and size_px is not None and claimed not in (size_px, size_px[::-1]):  # a photograph may say that it is turned
-        raise InputError(OTHER_SIZE.format(path=path, w=claimed[0], h=claimed[1], size=size_px))
-    if has_several_images(content):
-        raise InputError(f"{path} has several images, of which only one would be measured; write each of them to a file of its own.")
-    try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise InputError(f"{path} is not a readable image; replace it, or remove it from the sequence.")
-    _refuse_size(image.shape[1::-1], path)
-    if image.dtype.name not in KINDS:
-        raise InputError(f"{path} has {image.dtype.name} pixels; save it with 8 or 16 bits per channel.")
-    return np.asarray(image)
-
-
-def header_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) in the header of an image file, None if it is damaged; nothing is decoded.
-
-    Raises:
-        InputError: the file is missing, or an OpenEXR image.
-    """
-    return claimed_size(_content(path))
-
-
-def _content(path: Path) -> bytes:
-    try:
-        content = bounded.bytes_of(path, bounded.IMAGE_BYTES)
-    except OSError as error:
-        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
-    _refuse_open_exr(content[:8], path)
-    return content
-
-
-def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:
-    if size_px is None or min(size_px) < 1:
-        raise InputError(f"{path} is not a readable image; replace it, or remove it from the sequence.")
-    if size_px[0] * size_px[1] > MAX_PIXELS or max(size_px) > MAX_SIDE_PX:
-        raise InputError(f"{path} has {size_px[0]}×{size_px[1]} pixels, more than can be measured; scale the footage down.")
-
-
-def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
-    """Grey values (h, w) float32 0…255 of an image of 8 or 16 bits (of which `white` is white) or float 0…1, grey, BGR or BGRA."""
-    if image.dtype == np.float64:
-        image = image.astype(np.float32)
-    if image.ndim == 3:
-        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY) if image.shape[2] >= 3 else image[:, :, 0]
-    if image.dtype == np.uint16:
-        return (image / np.float32((white or WHITES[-1]) / 255)).astype(np.float32)
-    if image.dtype.kind == "f":
-        return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
-    return image.astype(np.float32)
-
-
-def colour(image: np.ndarray, white: float = 0.0) -> np.ndarray:
-    """RGB values (h, w, 3) float32 0…255 of an image as for `grey`."""
-    if image.ndim == 2 or image.shape[2] < 3:
-        return np.repeat(grey(image, white)[:, :, None], 3, axis=2)
-    return np.ascontiguousarray(np.stack([grey(image[:, :, channel], white) for channel in (2, 1, 0)], axis=2))
-
-
 def _check_movie(path: Path) -> None:
     """Only files with their own images are decoded: playlists and scripts would make the decoder open other files, even URLs."""
     if path.suffix.lower() not in MOVIE_ENDINGS:
@@ -398,11 +311,6 @@ def _check_movie(path: Path) -> None:
     first = _first_bytes(path, "movie")
     if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES):
         raise InputError(NO_MOVIE.format(path=path))
-
-
-def _refuse_open_exr(first: bytes, path: Path) -> None:
-    if first.startswith(OPEN_EXR):
-        raise InputError(f"{path} is an OpenEXR image, which is not supported; save the sequence as PNG or TIFF of 16 bits.")
 
 
 def _first_bytes(path: Path, what: str) -> bytes:
@@ -421,7 +329,7 @@ def _first_bytes(path: Path, what: str) -> bytes:
 def _check_signature(path: Path) -> None:
     """Refuse files that are no images by their first bytes, before anything is computed."""
     first = _first_bytes(path, "image")
-    _refuse_open_exr(first, path)
+    refuse_open_exr(first, path)
     if first.startswith(b"version "):
         raise InputError(f"{path} is a Git LFS placeholder of the image; fetch the images with `git lfs pull`.")
     if not first.startswith(SIGNATURES):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..images.sequence import decoded
+from ..images.picture import decoded
 from . import pictures
 from .document import SCRIPT, document, figure, notes, table
 

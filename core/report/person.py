@@ -16,7 +16,7 @@ from ..body.skin.posed import Poser, skins_in
 from ..body.skin.texture import TEXTURE, halves, pixels_of, sampled
 from ..foundation.errors import InputError
 from ..geometry.raster import Raster
-from ..images.sequence import decoded
+from ..images.picture import decoded
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -18,7 +18,7 @@ import cv2
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..images.sequence import decoded
+from ..images.picture import decoded
 from ..results.run_json import read_run
 from .arm import PERSON, VIEWS, ArmTakeSettings, clear_recording, make_arm_take
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..foundation import bounded
 from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
-from ..images.sequence import header_size, read_image
+from ..images.picture import header_size, read_image
 
 
 def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
@@ -107,7 +107,7 @@ def read_picture(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
         InputError: it cannot be read, or is of another size than the view.
     """
     size = header_size(path)
-    if size is None or size in (size_px, size_px[::-1]):
+    if size is None or size == size_px:
         image = read_image(path)
         size = image.shape[1], image.shape[0]
     if size != size_px:

@@ -14,7 +14,7 @@ from tricap.core.calibration.rig_files import read_any
 from tricap.core.foundation import bounded
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rig import read_rig
-from tricap.core.images.sequence import read_image
+from tricap.core.images.picture import read_image
 from tricap.core.motion.formats.bvh import read_bvh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.results.folder import Results

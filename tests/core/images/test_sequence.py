@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.images import sequence
+from tricap.core.images import picture, sequence
 from tricap.core.images.headers import has_several_images
-from tricap.core.images.sequence import ImageFiles, Movie, decoded, grey, open_sequence, read_image
+from tricap.core.images.picture import decoded, grey, read_image
+from tricap.core.images.sequence import ImageFiles, Movie, open_sequence
 
 RAMP = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 21
 
@@ -180,7 +181,7 @@ def test_images_of_a_kind_or_size_that_cannot_be_measured(tmp_path: Path, monkey
         read_image(write(tmp_path / "a.tif", np.zeros((8, 8), np.int32)))
     with pytest.raises(InputError, match="has 8192×8 pixels, more than can be measured"):
         read_image(write(tmp_path / "wide.png", np.zeros((8, 8192), np.uint8)))
-    monkeypatch.setattr(sequence, "MAX_PIXELS", 63)
+    monkeypatch.setattr(picture, "MAX_PIXELS", 63)
     with pytest.raises(InputError, match="has 8×8 pixels"):
         read_image(write(tmp_path / "b.png", np.zeros((8, 8), np.uint8)))
 
@@ -254,7 +255,7 @@ def test_a_playlist_is_no_movie(tmp_path: Path) -> None:
 
 
 def test_open_exr_is_told_by_name(tmp_path: Path) -> None:
-    (tmp_path / "0.exr").write_bytes(sequence.OPEN_EXR + b"\2\0\0\0" + b"\0" * 100)
+    (tmp_path / "0.exr").write_bytes(picture.OPEN_EXR + b"\2\0\0\0" + b"\0" * 100)
     for read in (lambda: open_sequence(tmp_path, images="*.exr", movie=None, view="L"), lambda: read_image(tmp_path / "0.exr")):
         with pytest.raises(InputError, match="is an OpenEXR image, which is not supported; save the sequence as PNG"):
             read()

@@ -9,7 +9,7 @@ import pytest
 
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.foundation.errors import InputError
-from tricap.core.images.sequence import decoded
+from tricap.core.images.picture import decoded
 from tricap.core.motion.tables import read_joints
 from tricap.core.run.take_run import open_run
 from tricap.core.synthetic import sample

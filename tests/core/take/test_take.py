@@ -328,7 +328,7 @@ def test_images_of_another_size_than_the_camera(footage: Path) -> None:
     path.write_bytes(cv2.imencode(".png", np.zeros((40, 30), np.uint8))[1].tobytes())
     opened = open_take(rewrite(footage))
     assert len(opened.read(2)) == 3
-    with pytest.raises(InputError, match="Frame 3 of view C has 30×40 pixels, but its camera in rig.toml has 40×30"):
+    with pytest.raises(InputError, match="0003.png has 30×40 pixels, but its camera has 40×30"):
         opened.read(3)
 
 
