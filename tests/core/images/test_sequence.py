@@ -190,8 +190,8 @@ def write_movie(path: Path, frames: int) -> Path:
     """Frames of the grey values 20, 40, …, with one bright square that wanders; JPEG-compressed."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
     assert writer.isOpened()
-    for picture in movie_pictures(frames):
-        writer.write(np.repeat(picture[:, :, None], 3, axis=2))
+    for shown in movie_pictures(frames):
+        writer.write(np.repeat(shown[:, :, None], 3, axis=2))
     writer.release()
     return path
 
