@@ -262,6 +262,13 @@ class _Round:
     smoothed: bool
 
 
+def matched_seeds(views: Views, grid: TemplateGrid, seeds: Approximations, matching: MatchingSettings) -> int:
+    """How many of the seeds match in as many views as are required."""
+    front = _seed_front(grid, seeds, views.reference)
+    first = _measure(views, grid.xy(front.cell), front, matching, EQUAL_SIGMA_PX, pairs=False)
+    return int(_enough(first.matched, views.required_matches(False)).sum())
+
+
 def grow_regions(
     views: Views,
     grid: TemplateGrid,

@@ -17,9 +17,9 @@ from ..matching import foreground as fg
 from ..matching.constraints import constrain
 from ..matching.extension import extend
 from ..matching.occlusion_check import fails_occlusion_check
-from ..matching.region_growing import OF_FIELD, MatchedField, grow_regions
+from ..matching.region_growing import OF_FIELD, MatchedField, grow_regions, matched_seeds
 from ..matching.seeds import Approximations
-from ..matching.views import TemplateGrid
+from ..matching.views import TemplateGrid, Views
 from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
 from ..take.footage import Footage
@@ -31,6 +31,8 @@ FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual
 
 
 FEW = 300  # points of the first frame; with fewer, whose rays miss each other, a third view may refuse what two would match
+NOISE_PX = 1.0  # sigma of the Gaussian that takes noise away
+CLEARLY_MORE, FEWEST_MORE = 1.25, 5  # seeds that match in smoothed images: as many times, and by at least so many
 MISFIT = 0.5  # of the largest misfit of rays that a point may have
 
 
@@ -118,6 +120,7 @@ def _hardly_anything(first: MeasuredFrame, settings: MeasureSettings, *, anythin
 
 def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, monitor: Monitor) -> MeasuredFrame:
     """The surface of a frame from its start."""
+    now = replace(now, views=_without_noise(now, start.seeds, settings))
     views, ref, where = now.views, now.views.reference, replace(start.where, silhouettes=now.silhouettes)
     field = _matched(now, start.seeds, settings, where, monitor)
     why = why_removed(field, views.base, ref, settings.surface)
@@ -141,6 +144,15 @@ def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, moni
         removed_px=now.footage.to_full(views.rows.to_frame(removed_xy)).astype(np.float32),
         removed_why=removed_why,
     )
+
+
+def _without_noise(now: FrameViews, seeds: Approximations, settings: MeasureSettings) -> Views:
+    """The views to match: smoothed where noise hides the texture, so that clearly more seeds match then."""
+    if settings.growing.method == "published" or not len(seeds.depth_m):
+        return now.views
+    smooth = now.views.smoothed(NOISE_PX)
+    usual, smoothed = (matched_seeds(views, now.grid, seeds, settings.matching) for views in (now.views, smooth))
+    return smooth if smoothed > CLEARLY_MORE * usual and smoothed - usual >= FEWEST_MORE else now.views
 
 
 def _matched(now: FrameViews, seeds: Approximations, settings: MeasureSettings, where: fg.Foreground, monitor: Monitor) -> MatchedField:

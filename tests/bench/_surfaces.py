@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from tricap.core.geometry.camera import Camera
 from tricap.core.images.sampling import SplineImage
@@ -103,14 +103,17 @@ def sphere(radius_m: float) -> Surface:
     return Surface(hit=hit, distance_m=distance_m, normal=normal)
 
 
-def texture(kind: str, seed: int) -> np.ndarray:
-    """Grey values (TEXELS, TEXELS): "strong" cloth, "weak" skin, or "repetitive" checks of 16 mm with a little of their own."""
+def texture(kind: str | float, seed: int) -> np.ndarray:
+    """Grey values (TEXELS, TEXELS): "strong" cloth, "weak" skin, "repetitive" checks of 16 mm with a little of their own; or cloth whose
+    contrast (standard deviation over mean) is a number."""
     random = np.random.default_rng(seed)
 
     def blurred(sigma: float) -> np.ndarray:
         g = gaussian_filter(random.standard_normal((TEXELS, TEXELS)), sigma, mode="wrap")
         return g / g.std()
 
+    if not isinstance(kind, str):
+        return 120 * (1 + kind * blurred(3.0))
     if kind == "strong":
         return 120 + 25 * blurred(3.0)
     if kind == "weak":
@@ -120,9 +123,10 @@ def texture(kind: str, seed: int) -> np.ndarray:
 
 
 def render(
-    surface: Surface, kind: str, *, noise: float = 2.0, seed: int = 0, focal_px: float = FOCAL_PX
+    surface: Surface, kind: str | float, *, noise: float = 2.0, seed: int = 0, focal_px: float = FOCAL_PX, blur_px: int = 1
 ) -> tuple[list[Camera], list[np.ndarray]]:
-    """The cameras and their images (h, w) of whole grey values, with unlike gains and offsets. The texture's grain is one in pixels."""
+    """The cameras and their images (h, w) of whole grey values, with unlike gains and offsets. The texture's grain is one in pixels; by
+    `blur_px` everything moves to the right during the exposure."""
     rig, look, texel_m = cameras(focal_px), SplineImage(texture(kind, seed)), TEXEL_M * FOCAL_PX / focal_px
     random = np.random.default_rng(seed + 1000)
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
@@ -130,6 +134,6 @@ def render(
     for camera, gain, offset in zip(rig, (0.9, 1.0, 1.1), (8.0, 0.0, -6.0)):
         depth, a, b = surface.hit(camera.centre_m, camera.rays(np.stack([x, y], axis=-1)))
         grey = look.sample(*(np.nan_to_num(c / texel_m + TEXELS / 2).astype(np.float32) for c in (a, b)))
-        grey = np.where(np.isfinite(depth), grey, BACKGROUND)
+        grey = uniform_filter1d(np.where(np.isfinite(depth), grey, BACKGROUND), blur_px, axis=1)
         images.append(np.rint(np.clip(gain * grey + offset + noise * random.standard_normal(grey.shape), 0, 255)).astype(np.float32))
     return rig, images

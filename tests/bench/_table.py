@@ -154,8 +154,17 @@ def clip(table: dict[str, Any]) -> Iterator[Row]:
         yield Row("clip", f"{row['frames']} frames, {row['stage']} [MB]", row["peak_mb"], "memory", "")
 
 
+def texture(rows: list[dict[str, Any]]) -> Iterator[Row]:
+    """Weak and strong texture, beside semi-global matching."""
+    of = {(row["what"], row["method"]): row for row in rows}
+    for what in ("contrast 2 %", "contrast 8 %", "contrast 30 %", "contrast 8 %, noise 8", "contrast 8 %, blur 6 px"):
+        own, peer = of[what, "default"], of[what, "StereoSGBM, both pairs"]
+        yield Row("texture", f"median error, {what}", own.get("median [mm]", 1e3) / peer["median [mm]"], "error", "StereoSGBM")
+        yield Row("texture", f"not covered, {what}", 1 - own["coverage"], "error", "")
+
+
 STAGES: dict[str, Callable[[Any], Iterator[Row]]] = {
-    f.__name__: f for f in (matching, constraints, tracking, fit, calibration, run, memory, clip)
+    f.__name__: f for f in (matching, constraints, texture, tracking, fit, calibration, run, memory, clip)
 }
 
 

@@ -286,3 +286,21 @@ def test_the_person_is_followed_by_seeds_of_any_spacing(plane_take: Path, tmp_pa
         found = starts.FrameStarts(job.measured_footage, starts.MeasureSettings.of(job.settings), job.results)
         start, _ = found.at(found.first, Monitor())
     assert len(start.person_m) >= max(4, len(start.seeds.depth_m) // 2)
+
+
+@pytest.mark.parametrize("noise, smoothed", [(1.0, False), (20.0, True)])
+def test_noise_that_hides_the_texture_is_smoothed(
+    tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, noise: float, smoothed: bool
+) -> None:
+    """Where clearly more seeds match in smoothed images, all is measured in these; elsewhere nothing changes."""
+    plane = scenes.Body(half_m=(0.26, 0.2), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane]], noise=noise)
+    now = scenes.measure(take, tmp_path / "now")[0]
+    assert np.median(np.abs(plane.distance_m(now.cloud.xyz_m))) < 0.6 * scenes.pixel_m
+    monkeypatch.setattr(measure, "FEWEST_MORE", 10_000)
+    if smoothed:
+        assert len(now.cloud.xyz_m) > 500
+        with pytest.raises(measure.NothingMeasured):
+            scenes.measure(take, tmp_path / "without")
+    else:
+        same(now, scenes.measure(take, tmp_path / "without")[0])
