@@ -238,7 +238,7 @@ def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> tuple[_Ca
     """A limb in N poses, and the fingers of a hand that it carries: the fitted hand ends at its knuckles. A hand alone has its fingers."""
     bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
     R, head = frames_of_bones(limb.parameters.skeleton, state.lengths_m, poses, bones)
-    fingers = _hand(state, bones, head, R, of_hand=np.s_[:] if limb.hand is not None else FINGERS)
+    fingers = _hands(state, bones, head, R, of_hand=np.s_[:] if limb.hand is not None else FINGERS)
     if limb.hand is not None and fingers is not None:
         return fingers, None
     return _Capsules.of(state, bones, free_bones(limb.parameters), head, R), fingers
@@ -246,10 +246,10 @@ def _limb_capsules(limb: Limb, poses: np.ndarray, state: BodyState) -> tuple[_Ca
 
 def _fingers(state: BodyState, bones: np.ndarray) -> _Capsules | None:
     """The fingers of hands among some of a body's bones."""
-    return _hand(state, bones, state.head_m[None, bones], state.R[None, bones], of_hand=FINGERS)
+    return _hands(state, bones, state.head_m[None, bones], state.R[None, bones], of_hand=FINGERS)
 
 
-def _hand(state: BodyState, bones: np.ndarray, head: np.ndarray, R: np.ndarray, of_hand: slice) -> _Capsules | None:
+def _hands(state: BodyState, bones: np.ndarray, head: np.ndarray, R: np.ndarray, of_hand: slice) -> _Capsules | None:
     """Some of the capsules of the hands among bones (K,), whose frames in N poses are `head` (N, K, 3) and R (N, K, 3, 3); None if there
     are no hands."""
     names = [state.skeleton.bones[b].name for b in bones.tolist()]

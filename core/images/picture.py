@@ -17,13 +17,13 @@ WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
 
 
-def read_image(path: Path, white: float = 0.0) -> np.ndarray:
-    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour; `white` of 16 bits if it is not 65535.
+def read_image(path: Path) -> np.ndarray:
+    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour.
 
     Raises:
         InputError: see `decoded`.
     """
-    return grey(decoded(path), white)
+    return grey(decoded(path))
 
 
 def decoded(path: Path, size_px: tuple[int, int] | None = None) -> np.ndarray:

@@ -149,10 +149,8 @@ class SplineImage:
         if sigma not in self._smoothed:
             size = (_width(sigma[0]), _width(sigma[1]))
             grey = cv2.GaussianBlur(self._grey, size, sigmaX=sigma[0], sigmaY=sigma[1], borderType=cv2.BORDER_REFLECT_101)
-            before = self.smoothing
-            self._smoothed[sigma] = SplineImage(
-                grey, smoothing=(float(np.hypot(before[0], sigma[0])), float(np.hypot(before[1], sigma[1])))
-            )
+            both = np.hypot(self.smoothing, sigma).tolist()
+            self._smoothed[sigma] = SplineImage(grey, smoothing=(both[0], both[1]))
         return self._smoothed[sigma]
 
     def inside(self, xy: np.ndarray, margin: np.ndarray | float) -> np.ndarray:

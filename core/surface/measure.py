@@ -87,8 +87,9 @@ def measure_frames(
         if measured is None:
             now = now or frame_views(footage, frame, settings, first=not done)
             measured = _measure(now, settings, start, part)
-            if not done and _hardly_anything(measured, settings, anything=first is not None):
-                raise NothingMeasured(frame, points=len(measured.cloud.xyz_m))
+            points = len(measured.cloud.xyz_m)
+            if not done and (not points or (first is None and _refused_by_a_view(measured, settings))):
+                raise NothingMeasured(frame, points=points)
             _checkpoint(results, measured, footage)
         starts.measured(measured.field, measured.cloud.xyz_m)
         yield measured
@@ -112,10 +113,10 @@ def measure_piece(footage: Footage, settings: MeasureSettings, results: Results,
     monitor.step("surface", 1, 1)
 
 
-def _hardly_anything(first: MeasuredFrame, settings: MeasureSettings, *, anything: bool) -> bool:
-    """Whether the first frame shows nothing; or hardly anything, with rays that miss each other, unless `anything` will do."""
-    points, misfit_px = len(first.cloud.xyz_m), finite_median(first.field.residual_px)
-    return not points or (not anything and points < FEW and misfit_px > MISFIT * settings.growing.max_residual_px)
+def _refused_by_a_view(measured: MeasuredFrame, settings: MeasureSettings) -> bool:
+    """Whether a frame has few points, whose rays miss each other nearly as much as they may."""
+    few = len(measured.cloud.xyz_m) < FEW
+    return few and finite_median(measured.field.residual_px) > MISFIT * settings.growing.max_residual_px
 
 
 def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, monitor: Monitor) -> MeasuredFrame:

@@ -22,7 +22,7 @@ from .settings import TrackStatus
 MOST_CORNERS = 1000  # of a polygon, as in take.toml
 FARTHEST_PX = 1e6  # of a corner, as in take.toml
 SMALLEST_PX2 = 1.0  # area of a polygon
-MOST_POINTS = 10_000
+MOST_POINTS = 10_000  # that are followed at once: their patches are in memory together
 MOST_VERTICES = 4000  # of the outline that starts from a polygon: its fit needs memory by their square
 MAX_COMPARED = 1000  # names among which the nearest to a misspelt one is searched
 
@@ -52,14 +52,14 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
         raise InputError(f"{path} is not a CSV table ({error}); save it as CSV in UTF-8.") from error
     if not rows:
         raise InputError(f"{path} has no points; write a line {','.join(needed)} and one line for each point.")
+    if len(rows) > MOST_POINTS:
+        raise InputError(f"{path} has {len(rows)} points; {MOST_POINTS} is the most that are followed at once.")
     for name in needed:
         if name not in rows[0]:
             hint = "separate them by commas, not semicolons" if ";" in str(next(iter(rows[0]))) else "its first line must name them"
             raise InputError(f"{path} has no column “{name}”; the columns are {', '.join(needed)}: {hint}.")
     xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
     names = tuple((row["point"] or "").strip() for row in rows)
-    if len(rows) > MOST_POINTS:
-        raise InputError(f"{path} has {len(rows)} points; {MOST_POINTS} is the most that are followed at once.")
     views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
     if "" in names or len(set(zip(names, views))) < len(names):
         raise InputError(f"{path} names a point twice or not at all; give every point its own name.")
@@ -249,7 +249,7 @@ def _crossing_sides(polygon_px: np.ndarray) -> tuple[int, int] | None:
     start, along = polygon_px, np.roll(polygon_px, -1, axis=0) - polygon_px
     for i in range(len(start) - 2):
         others, ahead = start[i + 2 :] - start[i], along[i + 2 :]
-        turned = np.cross(np.append(along[i], 0.0), np.pad(ahead, ((0, 0), (0, 1))))[:, 2]
+        turned = along[i, 0] * ahead[:, 1] - along[i, 1] * ahead[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             here = (others[:, 0] * ahead[:, 1] - others[:, 1] * ahead[:, 0]) / turned
             there = (others[:, 0] * along[i, 1] - others[:, 1] * along[i, 0]) / turned

@@ -25,6 +25,7 @@ import _surfaces as surfaces
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
+from surface import told
 
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
@@ -137,14 +138,6 @@ def scored(what: str, method: str, truth: np.ndarray, xyz: np.ndarray, sigma: np
     if np.isfinite(sigma).all():
         row["z"] = 1.4826 * float(np.median(np.abs(BODY.distance_m(xyz) / sigma)))
     return row
-
-
-def told(found: list[Row]) -> str:
-    """The rows as a table."""
-    columns = list(dict.fromkeys(name for row in found for name in row))
-    cells = [columns] + [[f"{v:.2f}" if isinstance(v := row.get(name, ""), float) else str(v) for name in columns] for row in found]
-    width = [max(len(line[i]) for line in cells) for i in range(len(columns))]
-    return "\n".join("  ".join(text.ljust(n) for text, n in zip(line, width)).rstrip() for line in cells)
 
 
 def main() -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
+from tricap.core.images.sequence import ImageFiles
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import AUTO_BODY, Take, read_take
 
@@ -330,6 +331,9 @@ def test_images_of_another_size_than_the_camera(footage: Path) -> None:
     assert len(opened.read(2)) == 3
     with pytest.raises(InputError, match="0003.png has 30×40 pixels, but its camera has 40×30"):
         opened.read(3)
+    unmeasured = tuple(ImageFiles(sequence.files(), sequence.source) for sequence in opened.sequences)
+    with pytest.raises(InputError, match="Frame 3 of view C has 30×40 pixels, but its camera in rig.toml has 40×30"):
+        open_take(rewrite(footage), unmeasured).read(3)
 
 
 def test_images_of_another_size_are_not_decoded(footage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
