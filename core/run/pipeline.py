@@ -300,7 +300,7 @@ def _track_points(run: Run, monitor: Monitor, guide: Guide | None = None) -> dic
 
     kept = "Stopped: the surface of all frames is kept, and the tracks as far as they are; run it again to go on."
     with run.resumable(stopped=lambda: kept):
-        rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=run.measured.limit_px)
+        rules = TrackingRules.of(s, run.measured)
         steps = track_frames(run.measured_footage, run.measured, rules, run.results, monitor, guide)
         filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     run.trajectories = filtered.kept

@@ -27,6 +27,7 @@ class FrameSummary:
     key: str  # of its checkpoint
     points: int
     limit_px: float  # by which rays were allowed to miss each other
+    smoothed_px: float  # sigma of the Gaussian that took noise away, 0 without one
     residual_px: float  # median
     sigma_m: float  # median
 
@@ -34,7 +35,15 @@ class FrameSummary:
 def summary_of(m: MeasuredFrame) -> FrameSummary:
     """The summary of a frame that was measured."""
     residual, sigma = finite_median(m.cloud.residual_px), finite_median(m.cloud.sigma_m)
-    return FrameSummary(frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma)
+    return FrameSummary(
+        frame=m.frame,
+        key=m.key,
+        points=len(m.cloud.xyz_m),
+        limit_px=m.field.limit_px,
+        smoothed_px=m.smoothed_px,
+        residual_px=residual,
+        sigma_m=sigma,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,6 +77,11 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
     def limit_px(self) -> float:
         """The median over the frames of the distance by which rays were allowed to miss each other."""
         return float(np.median([s.limit_px for s in self.summaries]))
+
+    @property
+    def smoothed_px(self) -> float:
+        """The sigma of the Gaussian that took noise away in most of the frames, or 0."""
+        return sorted(s.smoothed_px for s in self.summaries)[len(self) // 2]
 
     def clouds(self, corrected: Callable[[PointCloud], PointCloud]) -> Sequence[PointCloud]:
         """The frames' clouds, each read and corrected on access."""

@@ -19,7 +19,7 @@ from ..matching.extension import extend
 from ..matching.occlusion_check import fails_occlusion_check
 from ..matching.region_growing import OF_FIELD, MatchedField, grow_regions, matched_seeds
 from ..matching.seeds import Approximations
-from ..matching.views import TemplateGrid, Views
+from ..matching.views import TemplateGrid
 from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
 from ..take.footage import Footage
@@ -60,6 +60,7 @@ class MeasuredFrame:
     key: str
     removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters removed
     removed_why: np.ndarray  # (M,) see `why_removed`
+    smoothed_px: float  # sigma of the Gaussian that took noise away, 0 without one
 
     @property
     def of_patches(self) -> "MeasuredFrame":
@@ -121,7 +122,8 @@ def _refused_by_a_view(measured: MeasuredFrame, settings: MeasureSettings) -> bo
 
 def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, monitor: Monitor) -> MeasuredFrame:
     """The surface of a frame from its start."""
-    now = replace(now, views=_without_noise(now, start.seeds, settings))
+    smoothed_px = _noise_px(now, start.seeds, settings)
+    now = replace(now, views=now.views.smoothed(smoothed_px)) if smoothed_px else now
     views, ref, where = now.views, now.views.reference, replace(start.where, silhouettes=now.silhouettes)
     field = _matched(now, start.seeds, settings, where, monitor)
     why = why_removed(field, views.base, ref, settings.surface)
@@ -144,16 +146,17 @@ def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, moni
         key=start.key,
         removed_px=now.footage.to_full(views.rows.to_frame(removed_xy)).astype(np.float32),
         removed_why=removed_why,
+        smoothed_px=smoothed_px,
     )
 
 
-def _without_noise(now: FrameViews, seeds: Approximations, settings: MeasureSettings) -> Views:
-    """The views to match: smoothed where noise hides the texture, so that clearly more seeds match then."""
+def _noise_px(now: FrameViews, seeds: Approximations, settings: MeasureSettings) -> float:
+    """By how much the views are smoothed before they are matched: where noise hides the texture, so that clearly more seeds match then."""
     if settings.growing.method == "published" or not len(seeds.depth_m):
-        return now.views
+        return 0.0
     smooth = now.views.smoothed(NOISE_PX)
     usual, smoothed = (matched_seeds(views, now.grid, seeds, settings.matching) for views in (now.views, smooth))
-    return smooth if smoothed > CLEARLY_MORE * usual and smoothed - usual >= FEWEST_MORE else now.views
+    return NOISE_PX if smoothed > CLEARLY_MORE * usual and smoothed - usual >= FEWEST_MORE else 0.0
 
 
 def _matched(now: FrameViews, seeds: Approximations, settings: MeasureSettings, where: fg.Foreground, monitor: Monitor) -> MatchedField:
@@ -190,6 +193,7 @@ def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
         "reduction": footage.reduction,
         "removed_px": m.removed_px,
         "removed_why": m.removed_why,
+        "smoothed_px": np.array(m.smoothed_px),
     }
     results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
 
@@ -240,4 +244,13 @@ def _measured(footage: Footage, frame: int, key: str, a: dict[str, np.ndarray]) 
     why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not store it
     removed = a.get("removed_px", np.zeros((0, field.xy.shape[1], 2), dtype=np.float32))
     cloud = in_full_pixels(cloud, footage)
-    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key, removed_px=removed, removed_why=why)
+    return MeasuredFrame(
+        frame=frame,
+        field=field,
+        cloud=cloud,
+        foreground=where,
+        key=key,
+        removed_px=removed,
+        removed_why=why,
+        smoothed_px=float(a.get("smoothed_px", 0.0)),
+    )

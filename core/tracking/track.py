@@ -13,8 +13,9 @@ The images are therefore tracked without their mean over about a patch (`without
 other.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from ..matching.least_squares import MatchingSettings
 from ..matching.region_growing import MatchedField
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
+from ..surface.frames import MeasuredFrames
 from ..surface.measure import MeasuredFrame
 from ..surface.starts import FrameImages, load_images
 from ..take.footage import Footage
@@ -142,7 +144,7 @@ def _thinned(field: MatchedField, spacing_px: int) -> np.ndarray:
     return np.flatnonzero((i % n == 0) & (j % n == 0))
 
 
-ALGORITHM = "tracking 18"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 19"  # part of every key: raise it when the same input gives other numbers
 SHADING_PATCHES = 1.3  # side of the window whose mean is shading, in sides of a patch
 MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
 
@@ -155,6 +157,18 @@ class TrackingRules:
     tracking: TrackingSettings
     enhance: EnhanceSettings | None = None
     limit_px: float = 0.0  # rays were allowed to miss by as much when the surface was measured
+    smoothed_px: float = 0.0  # sigma of the Gaussian against noise, as when the surface was measured
+
+    @staticmethod
+    def of(settings: Mapping[str, Any], measured: MeasuredFrames) -> "TrackingRules":
+        """Those of settings by group, for frames that were measured."""
+        return TrackingRules(
+            matching=settings["matching"],
+            tracking=settings["tracking"],
+            enhance=settings["enhance"],
+            limit_px=measured.limit_px,
+            smoothed_px=measured.smoothed_px,
+        )
 
     def view(self, footage: Footage) -> TrackingView:
         """What a tracking step needs to know of the recording."""
@@ -211,7 +225,8 @@ def track_frames(
     view = rules.view(footage)
     no_template = no_templates(view.matching, view.rows.step)
     state = _State(before=None, current=None, templates=no_template, lost=none_lost(len(view.cameras)), next_identity=0)
-    key = store.digest(ALGORITHM, repr((rules.matching, rules.tracking, rules.limit_px, rules.enhance)), *([guide.key] if guide else []))
+    stamp = repr((rules.matching, rules.tracking, rules.limit_px, rules.smoothed_px, rules.enhance))
+    key = store.digest(ALGORITHM, stamp, *([guide.key] if guide else []))
     group = "guided" if guide else "tracks"
     images: FrameImages | None = None
     for i, surface in enumerate(measured):
@@ -235,12 +250,13 @@ def track_frames(
 
 
 def _images(footage: Footage, frame: int, rules: TrackingRules) -> FrameImages:
-    """Read a frame for tracking: without its shading, unless tracking is that of the papers."""
+    """Read a frame for tracking: without its noise and its shading, unless tracking is that of the papers."""
     images = load_images(footage, frame, rules.enhance)
     if rules.tracking.scheme != "space":
         return images
     window_px, row_step = round(SHADING_PATCHES * rules.matching.patch_px), footage.take.rows_at(frame).step
-    level = [without_shading(image.grey, window_px, row_step=row_step) for image in images.spline]
+    smooth = [image.smoothed(rules.smoothed_px, row_step) for image in images.spline] if rules.smoothed_px else images.spline
+    level = [without_shading(image.grey, window_px, row_step=row_step) for image in smooth]
     return FrameImages(grey=level, spline=[SplineImage(grey) for grey in level])
 
 

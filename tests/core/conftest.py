@@ -146,7 +146,9 @@ def track(
     footage = open_take(read_take(folder))
     s = take_run.settings_of(footage.take.settings, overrides or {}, "take.toml")
     limit_px = float(np.median([m.field.limit_px for m in measured]))
-    rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=limit_px)
+    rules = TrackingRules(
+        matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=limit_px, smoothed_px=measured[0].smoothed_px
+    )
     return list(track_frames(footage, measured, rules, Results(out), monitor or Monitor(), guide))
 
 

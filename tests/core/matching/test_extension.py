@@ -133,7 +133,9 @@ def test_tracks_start_from_patches_alone(weak: tuple[Views, MatchedField, Any]) 
     grey = np.full(views.template.shape, 100.0)
     cloud = point_cloud(more, grey, views.base, views.reference, 0, SurfaceSettings())
     none = np.zeros((0, 3, 2)), np.zeros(0, dtype=np.uint8)
-    frame = MeasuredFrame(frame=0, field=more, cloud=cloud, foreground=EVERYWHERE, key="", removed_px=none[0], removed_why=none[1])
+    frame = MeasuredFrame(
+        frame=0, field=more, cloud=cloud, foreground=EVERYWHERE, key="", removed_px=none[0], removed_why=none[1], smoothed_px=0.0
+    )
     assert np.array_equal(cloud.extended, more.extended) and 0 < cloud.extended.sum() < len(more.cell)
     assert np.array_equal(frame.of_patches.field.cell, field.cell)
     assert np.array_equal(frame.of_patches.cloud.xyz_m, cloud.xyz_m[~more.extended])

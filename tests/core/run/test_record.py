@@ -23,7 +23,7 @@ from tricap.core.tracking.trajectories import with_kinematics
 
 
 def summary(frame: int, points: int, sigma_m: float, residual: float) -> FrameSummary:
-    return FrameSummary(frame=frame, key="", points=points, limit_px=1.0, residual_px=residual, sigma_m=sigma_m)
+    return FrameSummary(frame=frame, key="", points=points, limit_px=1.0, smoothed_px=0.0, residual_px=residual, sigma_m=sigma_m)
 
 
 def table() -> FrameTable:

@@ -1,5 +1,6 @@
 """Tracking against exact motion: drift, sigma, false points, fields, new points; trajectories, their kinematics and their filters."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -70,6 +71,22 @@ def test_shading_that_stays_in_place_does_not_hold_a_point_back(tmp_path: Path, 
     error, on_it = errors(bodies, tracks, 0.035)
     drift_px = np.linalg.norm(error[..., :2], axis=2)[:, on_it & tracks.visible[0]] / scenes.pixel_m
     assert np.isfinite(drift_px[-1]).sum() > 30 and np.nanmedian(drift_px[-1]) < 0.2
+
+
+def test_points_are_followed_in_the_images_in_which_they_were_measured(tmp_path: Path, scenes: Any) -> None:
+    """Where noise hides the texture, surface and tracks are both measured in smoothed images."""
+    bodies, rig = moving_plane(scenes, 3), scenes.three_cameras()
+    take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=20.0)
+    measured = scenes.measure(take, tmp_path / "out", COARSE)
+    assert {m.smoothed_px for m in measured} == {1.0}
+    raw = [replace(m, smoothed_px=0.0) for m in measured]
+    followed = []
+    for name, frames in (("smooth", measured), ("raw", raw)):
+        tracks = assemble(scenes.track(take, tmp_path / name, frames, {"tracking": {"spacing_px": 12}}), 25.0)
+        error, on_it = errors(bodies, tracks, 0.035)
+        drift_px = np.linalg.norm(error[..., :2], axis=2)[:, on_it & tracks.visible[0]] / scenes.pixel_m
+        followed.append(np.flatnonzero(drift_px[-1] < 0.5))
+    assert len(followed[0]) > max(30, 2 * len(followed[1]))
 
 
 def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
