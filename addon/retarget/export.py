@@ -15,11 +15,12 @@ from ...core.motion.formats.bvh import write_bvh
 from ...core.motion.formats.c3d import Segments, write_c3d
 from ...core.motion.formats.markers import Markers, metres_per, rate, write_points_csv
 from ...core.motion.formats.opensim import write_opensim
+from ...core.motion.formats.ply import read_ply
 from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import is_of_points, read_motion_source, read_points
 from ...core.motion.tables import read_joints
-from ...core.results.folder import check_not_result, lost
+from ...core.results.folder import check_complete, check_not_result
 from ...core.results.listed_files import PLY, check_files, list_files
 from ...core.results.outputs import check_output
 from ...core.results.own_files import files_of
@@ -48,6 +49,8 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
         if ending in OTHERS or any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    if kind in BY_BLENDER:
+        bounded.check_name(file)
     if kind in BY_BLENDER and file.suffix.lower() not in ENDINGS[kind]:
         raise InputError(f"{file.name} does not end in {' or '.join(ENDINGS[kind])}; write the name with that ending.")
     check_output(file, [] if out is None else [out])
@@ -76,7 +79,8 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
         from .read import ended
 
         return ended(exporting_played(open_moving(out), kind, file, preset, monitor))
-    _check_complete(out, of if kind == "ply" else "")
+    of_body = kind != "ply" or of in ("", "skin")
+    check_complete(out, ("fit",) if of_body else (), of, all_there=True)
     if kind == "ply":
         return _copy_ply(out, file, of)
     if kind in POINTS:
@@ -97,18 +101,6 @@ def _added(points: Markers) -> str:
     some = [f"{name} in {n}" for name, n in zip(points.names, frames) if 0 < n < len(points.frames)]
     more = f" and {len(some) - LISTED} others" if len(some) > LISTED else ""
     return f"; frames without a place, which are filled: {', '.join(some[:LISTED])}{more}" if some else ""
-
-
-def _check_complete(out: Path, of: str) -> None:
-    """Check that the results in a folder are those that its run wrote; `of`: the folder of them that is exported.
-
-    Raises:
-        InputError: some are missing or cut.
-    """
-    run = read_run(out / "run.json") if (out / "run.json").is_file() else {}
-    for stage, names in lost(out, run).items():
-        if of in names or (stage == "fit" and of in ("", "skin")):
-            raise InputError(f"{', '.join(names)} in {out} is missing, cut, or lacks files; repeat the run, which makes it again.")
 
 
 def exporting_played(armature_object: Any, kind: str, file: Path, preset: str, monitor: Monitor) -> Generator[None, None, str]:
@@ -198,6 +190,8 @@ def _copy_ply(out: Path, folder: Path, of: str) -> str:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     check_files(folder, PLY)
     list_files(folder, PLY, [file.name for file in files])
+    for file in files:
+        read_ply(file)  # a damaged one is not spread
     for file in files:
         store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"

@@ -101,6 +101,7 @@ def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
     Raises:
         InputError: it cannot be read, or does not have exactly one motion.
     """
+    bounded.check_name(path)
     if not is_imported_by_blender(path):
         return read_motion_source(path, up=up, unit=unit)
     source = open_moving(path)

@@ -22,6 +22,7 @@ from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.motion.formats.ply import Ply, read_ply
 from ...core.motion.tables import JointTable, MotionTable, read_guessed, read_joints, read_motion
+from ...core.results.folder import check_complete
 from ...core.results.run_json import read_run
 from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
@@ -88,6 +89,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: 
     if not (out / "run.json").is_file():
         raise InputError(f"{out} has no results of Tricap (no run.json); choose the output folder of a run.")
     run = read_run(out / "run.json")
+    check_complete(out)
     warnings: list[str] = []
     footage = _footage(run, out, warnings)
     clouds = _clouds(out / "clouds", monitor, warnings)

@@ -41,6 +41,7 @@ MIN_POSITIONS = 12
 MIN_PATH = 0.02  # of the image width: a bar that moves less is static
 MIN_STATIC = 4  # positions that show whether the bar moves
 LONGEST_BAR_M = 20.0
+SHORTEST_BAR_M = 0.005
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -153,7 +154,7 @@ def measure_bar(
     Raises:
         InputError: the length or the diameter is impossible, images cannot be read, or the bar is not visible often enough.
     """
-    if not (math.isfinite(length_m) and 0 < length_m < LONGEST_BAR_M):
+    if not (math.isfinite(length_m) and SHORTEST_BAR_M <= length_m < LONGEST_BAR_M):
         raise InputError(
             f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
         )
@@ -270,12 +271,12 @@ def calibrate_rig(
         InputError: the data do not determine the rig or the world's frame; the message names what is missing.
     """
     world = world or WorldChoice()
-    if isinstance(observations, BarAndBoard):
-        calibration = calibrate_together(observations, monitor, focal_px, lens)
-    elif isinstance(observations, BarObservations):
-        calibration = calibrate_bar(observations, monitor, focal_px, lens)
-    else:
-        calibration = calibrate_boards(observations, monitor, focal_px, lens)
+    for seen in (observations.bars, observations.boards) if isinstance(observations, BarAndBoard) else (observations,):
+        verdict.refuse_same_footage(seen)
+    try:
+        calibration = _adjusted(observations, monitor, focal_px, lens)
+    except np.linalg.LinAlgError as error:
+        raise InputError(verdict.UNDETERMINED) from error
     verdict.refuse_if_useless(calibration)
     calibration = in_world(calibration, world)
     quality = assess(calibration, monitor)
@@ -295,6 +296,16 @@ def calibrate_rig(
     cameras = calibration.network.cameras(calibration.observations.names, calibration.observations.size_px)
     rig = Rig(cameras=cameras, metadata=metadata, sigmas=report.camera_sigmas(calibration))
     return CalibratedRig(rig=rig, calibration=calibration, quality=quality, verdict=judged)
+
+
+def _adjusted(
+    observations: BarObservations | BoardObservations | BarAndBoard, monitor: Monitor, focal_px: float | None, lens: Lens
+) -> Calibration:
+    if isinstance(observations, BarAndBoard):
+        return calibrate_together(observations, monitor, focal_px, lens)
+    if isinstance(observations, BarObservations):
+        return calibrate_bar(observations, monitor, focal_px, lens)
+    return calibrate_boards(observations, monitor, focal_px, lens)
 
 
 def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:

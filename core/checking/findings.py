@@ -9,6 +9,7 @@ from typing import Any
 class Cause(StrEnum):
     """The kind of fault, for programs; the values are those of `tricap check --json`."""
 
+    BACKGROUND = "background"
     BLANK_VIEW = "blank view"
     CLICKS = "clicks"
     CLOTHES = "clothes"

@@ -167,6 +167,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         *geometry_findings(footage.rig),
         *wide,
         *(doubtful(Cause.CLICKS, sentence, "See [[corrections]] in take.toml.") for sentence in odd),
+        *_own_backgrounds(footage),
         *([remark(Cause.REFERENCE_VIEW, footage.reference_note)] if footage.reference_note else []),
         *picture_findings(film.survey, names),
         *rate_findings(footage),
@@ -272,6 +273,20 @@ def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
     return [
         f"From frame {frames[at]} on, the rays of matched points miss each other by {after:.2g} px, before by {before:.2g} px: a view may "
         "have lost or doubled a frame there, or a camera was moved. Compare the views around it, and run both parts separately (--frames)."
+    ]
+
+
+def _own_backgrounds(footage: Footage) -> list[Finding]:
+    """Backgrounds that are images of their own view: whoever is in such an image is background there."""
+    given = [(view, sequence.files()) for view, sequence in zip(footage.take.views, footage.sequences) if view.background is not None]
+    return [
+        doubtful(
+            Cause.BACKGROUND,
+            f"The background of view {view.name}, {view.background}, is an image of this view: nobody is found there in that frame.",
+            "That is right if nobody is in it; otherwise take an image of the empty room.",
+        )
+        for view, files in given
+        if footage.take.folder / str(view.background) in files
     ]
 
 

@@ -8,6 +8,8 @@ from ..run.batch import Status, as_json, run_batch, summary
 from ..run.engine import Engine
 from .arguments import overrides
 
+MOST_WORKERS = 1000
+
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Run the takes; the summary's lines.
@@ -16,8 +18,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: see `run_batch`.
         Cancelled: finished work is saved.
     """
-    if not 1 <= args.workers <= 1000 or args.retries < 0:
-        raise InputError(f"--workers {args.workers} and --retries {args.retries} are out of range; write 1 or more, and 0 or more.")
+    if not 1 <= args.workers <= MOST_WORKERS:
+        raise InputError(f"--workers {args.workers} is out of range; write 1 to {MOST_WORKERS}.")
+    if args.retries < 0:
+        raise InputError(f"--retries {args.retries} is out of range; write 0 or more.")
     engine = Engine(scheduler=args.scheduler, workers=min(args.workers, len(args.takes)), retries=args.retries)
     try:
         outcomes = run_batch(args.takes, args.out, engine, overrides(args.set), monitor, restart=args.restart)

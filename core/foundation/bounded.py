@@ -91,6 +91,15 @@ def check_name(path: Path) -> None:
         raise InputError(f"The name of {_shown(path)} is not UTF-8; rename it, or a folder above it.") from error
 
 
+def is_path(text: str) -> bool:
+    """Whether a text from a file can be the name of a file or folder."""
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:  # lone surrogates
+        return False
+    return "\0" not in text
+
+
 def is_plain(name: str) -> bool:
     """Whether a name from a file is one line of text, which can be written into a line of another file."""
     return bool(name.strip()) and LINE_BREAKS_AND_CONTROLS.search(name) is None

@@ -35,6 +35,7 @@ UNDISTORT_STEPS = 12  # of Newton's method
 UNDISTORT_TOLERANCE = 1e-12  # of normalised coordinates
 SAME_PX = 0.01
 NEAREST_M = 1e-6  # in front of the camera
+LARGEST_SKEW = 0.05  # of a focal length: rows of pixels that are turned by 3 degrees against their columns
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -172,6 +173,12 @@ class Camera:
             S, Q, _ = lens.scale(self.distortions[:4], a, b)
             return S + a * a * Q, a * b * Q, S + b * b * Q
         return _brown_derivatives(self.distortions, a, b)
+
+
+def is_camera_matrix(matrix: np.ndarray) -> bool:
+    """Whether a matrix (3, 3) can be that of a camera."""
+    fx, fy = matrix[0, 0], matrix[1, 1]
+    return bool(fx > 0 and fy > 0 and abs(matrix[0, 1]) <= LARGEST_SKEW * fx and matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1])
 
 
 def project_all(cameras: Sequence[Camera], xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

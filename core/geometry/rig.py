@@ -14,7 +14,7 @@ import numpy as np
 from ..foundation import bounded, store
 from ..foundation.errors import InputError, shown
 from ..foundation.settings import nearest_name
-from .camera import EXTERIOR, INTERIOR, Camera
+from .camera import EXTERIOR, INTERIOR, Camera, is_camera_matrix
 from .rotation import rotation_from_vector, vector_from_rotation
 
 LARGEST_NUMBER = 1e12  # of a calibration in any unit; beyond it, powers of it overflow
@@ -204,8 +204,7 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
         model = "a fisheye lens has k1, k2, k3, k4" if fisheye else "this model has k1, k2, p1, p2, k3"
         raise InputError(f"{label} has {given.size} distortions; {model}.")
     distortions[: len(given)] = given
-    upright = matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1]
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not upright or min(size) < 8:
+    if not is_camera_matrix(matrix) or min(size) < 8:
         raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
     affinity = _array(entry, "affinity", (2,), label) if "affinity" in entry else np.zeros(2)
     return Camera(

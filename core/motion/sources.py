@@ -8,6 +8,7 @@ import numpy as np
 from ..body.shape import BodyShape, read_body
 from ..body.skeleton import bone_frames
 from ..foundation.errors import InputError
+from ..results.folder import check_complete
 from .formats.bvh import read_bvh
 from .formats.c3d import read_c3d
 from .formats.markers import Markers, metres_per, rate, read_points_csv
@@ -73,6 +74,7 @@ def from_run(out: Path) -> Motion:
     """
     if (out / "take.toml").is_file() and not (out / "body.toml").is_file():
         raise InputError(f"{out} is a take; give the folder with its results instead, which `tricap run` wrote.")
+    check_complete(out)
     shape = read_body(out / "body.toml")
     table = read_motion(out / "motion.csv", shape.skeleton)
     known = np.isfinite(table.values).all(axis=1)

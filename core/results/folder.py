@@ -217,20 +217,52 @@ class FitCheckpoints:
 
 def lost(folder: Path, run: Mapping[str, Any]) -> dict[str, list[str]]:
     """By stage, the results in a folder that have fewer files or bytes than when run.json was written (that of an earlier version does not
-    know)."""
+    know), or arrays that were changed since."""
     then, found = run.get("files", {}), dict[str, list[str]]()
     for stage, names in MADE_BY.items():
-        fewer = [name for name in names if name in then and any(now < was for now, was in zip(_size(folder / name), then[name]))]
+        fewer = [
+            name
+            for name in names
+            if name in then and (any(now < was for now, was in zip(_size(folder / name), then[name])) or _is_damaged(folder / name))
+        ]
         if fewer:
             found[stage] = fewer
     return found
 
 
+def check_complete(folder: Path, stages: Iterable[str] = ("fit",), of: str = "", *, all_there: bool = False) -> None:
+    """Check that the results of some stages, or those called `of`, are as their run wrote them, as far as they are there, or `all_there`.
+
+    Raises:
+        InputError: some are cut or changed, or missing.
+    """
+    run = run_json.read_run(folder / "run.json") if (folder / "run.json").is_file() else {}
+    for stage, names in lost(folder, run).items():
+        found = [name for name in names if all_there or (folder / name).exists()]
+        if of in found or (found and stage in stages):
+            what = f"{', '.join(found)} in {folder}"
+            raise InputError(f"{what} is missing, cut, changed, or lacks files; repeat the run, which makes it again.")
+
+
+def _files(path: Path) -> Iterable[Path]:
+    return (p for p in (files_of(path, path.name) if path.name in MADE_IN else [path]) if p.is_file())
+
+
 def _size(path: Path) -> tuple[int, int]:
     """The number of files that a result has, and their bytes."""
-    files = files_of(path, path.name) if path.name in MADE_IN else [path]
-    sizes = [p.stat().st_size for p in files if p.is_file()]
+    sizes = [p.stat().st_size for p in _files(path)]
     return len(sizes), sum(sizes)
+
+
+def _is_damaged(path: Path) -> bool:
+    """Whether arrays of a result are not as they were written."""
+    try:
+        for file in _files(path):
+            if file.suffix == ".npz":
+                store.load(file)
+    except InputError:
+        return True
+    return False
 
 
 def _written(folder: Path) -> list[Path]:

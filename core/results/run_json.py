@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 
 FORMAT, VERSION = "tricap-run", 1
@@ -56,6 +56,8 @@ def notes_of(run: Mapping[str, Any]) -> list[str]:
 def _invalid_table(run: Mapping[str, Any]) -> str | None:
     if any(not isinstance(table, dict) for table in run.get("settings", {}).values()):
         return "settings"
+    if not bounded.is_path(run.get("take", "")):
+        return "take"
     frames = run.get("frames", [0, 0])
     if len(frames) != 2 or any(type(f) is not int for f in frames) or not 0 <= frames[1] - frames[0]:
         return "frames"

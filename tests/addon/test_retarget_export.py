@@ -16,6 +16,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import matrix_from_euler, shortest
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
+from tricap.core.motion.formats.ply import write_mesh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.results.folder import Results
 from tricap.core.results.run_json import FORMAT, VERSION
@@ -131,14 +132,17 @@ def test_fingers_and_toes_go_with_the_measured_skin(empty: ModuleType, tmp_path:
 def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
     out = tmp_path / "out"
     for folder in ("skin", "clouds", "tracked"):
-        (out / folder).mkdir(parents=True)
-        (out / folder / "0003.ply").write_bytes(folder.encode())
+        write_mesh(out / folder / "0003.ply", np.full((3, 3), len(folder)), np.array([[0, 1, 2]]))
     for of, found in (("", "skin"), ("clouds", "clouds"), ("tracked", "tracked")):
         assert export_file(out, "ply", tmp_path / f"of {of}", "plain", Monitor(), of=of) == f"1 files from {found}/"
-        assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == found.encode()
+        assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == (out / found / "0003.ply").read_bytes()
     shutil.copy(out / "clouds" / "0003.ply", out / "clouds" / "0009.ply")
     (out / "run.json").write_text(json.dumps({"format": FORMAT, "version": VERSION, "frames": [0, 4]}))
     assert export_file(out, "ply", tmp_path / "of the run", "plain", Monitor(), of="clouds") == "1 files from clouds/"
+    (out / "clouds" / "0003.ply").write_bytes(b"ply\n, cut")
+    with pytest.raises(InputError, match="0003.ply is a PLY file without “end_header”"):
+        export_file(out, "ply", tmp_path / "damaged", "plain", Monitor(), of="clouds")
+    assert not (tmp_path / "damaged").exists()
     (out / "tracked" / "0003.ply").unlink()
     with pytest.raises(InputError, match="has no folder tracked/ with files; run the take first"):
         export_file(out, "ply", tmp_path / "none", "plain", Monitor(), of="tracked")
@@ -211,7 +215,7 @@ def test_results_that_are_gone_are_not_left_out_in_silence(empty: ModuleType, sm
     Results(out).write_run(json.loads((out / "run.json").read_text()))
     shutil.rmtree(out / "skin")
     for kind in ("fbx", "bvh", "ply"):
-        with pytest.raises(InputError, match="^skin in .* is missing, cut, or lacks files; repeat the run"):
+        with pytest.raises(InputError, match="^skin in .* is missing, cut, changed, or lacks files; repeat the run"):
             export_file(out, kind, tmp_path / f"a.{kind}", "plain", Monitor())
     assert "files from clouds/" in export_file(out, "ply", tmp_path / "ply", "plain", Monitor(), of="clouds")
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...foundation import bounded
 from ...foundation.errors import InputError
-from ...geometry.camera import Camera
+from ...geometry.camera import Camera, is_camera_matrix
 from ...geometry.rig import LARGEST_NUMBER
 from ...geometry.rotation import rotation_from_vector
 
@@ -82,7 +82,7 @@ def make_camera(
     Raises:
         InputError: it is impossible: no focal length, no size, a matrix that does not turn.
     """
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
+    if not is_camera_matrix(matrix) or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
         raise InputError(f"Camera “{name}” has an impossible matrix or size; the file is damaged.")
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tricap.core.calibration import calibrate
 from tricap.core.calibration.bars import BarObservations
 from tricap.core.calibration.boards.board import Lens
 from tricap.core.calibration.boards.observations import BoardObservations
@@ -72,6 +73,23 @@ def test_three_rates_calibrate_as_well_as_one() -> None:
     np.testing.assert_allclose(found, late_s[1:], atol=3e-4)
     assert mixed.verdict.light == "green"
     assert error_m(cameras, mixed.rig.cameras) < 1.2 * error_m(cameras, same.rig.cameras) + 2e-5
+
+
+def test_two_views_of_the_same_footage_and_cameras_that_are_not_determined_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    bars = of_rates(benchmark_cameras(), np.full(3, 24.0), np.zeros(3), np.zeros(3))
+    turned = np.array(bars.xy_px)
+    turned[:, 2] = turned[:, 0, ::-1] + np.random.default_rng(0).normal(
+        0, 0.05, turned[:, 0].shape
+    )  # encoded anew, ends in the other order
+    with pytest.raises(InputError, match="^Views L and R show the same footage; give each view the images of its own camera"):
+        calibrate_rig(replace(bars, xy_px=turned), Monitor())
+
+    def fails(*args: object) -> None:
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(calibrate, "calibrate_bar", fails)
+    with pytest.raises(InputError, match="^The image points do not determine the cameras; check that no camera was moved"):
+        calibrate_rig(bars, Monitor())
 
 
 @pytest.mark.slow

@@ -102,6 +102,7 @@ FAULTS = {
     "rotation as a matrix": (text({"rotation": "[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]"}), "must be 3 finite numbers"),
     "negative focal length": (text({"matrix": "[[-1500.0, 0, 380.0], [0, 1500.0, 290.0], [0, 0, 1.0]]"}), "impossible matrix"),
     "transposed matrix": (text({"matrix": "[[1500.0, 0, 0], [0, 1500.0, 0], [380.0, 290.0, 1.0]]"}), "impossible matrix"),
+    "a large skew": (text({"matrix": "[[1500.0, 200.0, 380.0], [0, 1500.0, 290.0], [0, 0, 1.0]]"}), "impossible matrix"),
     "tiny size": (text({"size": "[4, 576]"}), "impossible matrix or size"),
     "too many distortions": (text({"distortions": "[0, 0, 0, 0, 0, 0, 0, 0]"}), "has 8 distortions"),
     "fisheye": (text({"fisheye": '"yes"'}), "must be true or false"),

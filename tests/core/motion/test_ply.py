@@ -34,6 +34,20 @@ def test_more_of_a_cloud_follows_what_every_cloud_has(tmp_path: Path) -> None:
     assert back["rays"].tolist() == [3, 2, 3] and back["extended"].tolist() == [0, 1, 0]
 
 
+@pytest.mark.parametrize("place", [np.nan, np.inf])
+def test_points_without_a_place_and_more_bytes_than_promised_are_refused(tmp_path: Path, place: float) -> None:
+    given = cloud(4)
+    given["xyz_m"][2, 1] = place
+    write_cloud(tmp_path / "0000.ply", **given)
+    with pytest.raises(InputError, match="0000.ply has vertices without a place"):
+        read_ply(tmp_path / "0000.ply")
+    write_cloud(tmp_path / "0001.ply", **cloud(4))
+    whole = (tmp_path / "0001.ply").read_bytes()
+    (tmp_path / "0001.ply").write_bytes(whole.replace(b"element vertex 4", b"element vertex 3"))
+    with pytest.raises(InputError, match="0001.ply is longer than its header says"):
+        read_ply(tmp_path / "0001.ply")
+
+
 @pytest.mark.parametrize("corners", [3, 4])
 def test_mesh_round_trip(tmp_path: Path, corners: int) -> None:
     vertices = np.random.default_rng(1).normal(size=(50, 3))

@@ -9,7 +9,7 @@ import pytest
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import read_ply
-from tricap.core.results.folder import Results, lost
+from tricap.core.results.folder import Results, check_complete, lost
 from tricap.core.surface.cloud import PointCloud, write_cloud
 from tricap.core.tracking.trajectories import Filtered, Trajectories, write_trajectories
 
@@ -118,11 +118,36 @@ def test_run_json(tmp_path: Path) -> None:
     ("blend", [1], "blend"), ("blend", "x", "blend"),
     ("stages", {"fit": {"joint_sigma_mm": 10**18}}, "fit"), ("settings", [], "settings"), ("settings", {"skin": 3}, "settings"),
     ("warnings", [1], "warnings"), ("inputs", {"rig.toml": 5}, "inputs"), ("views", "LCR", "views"), ("take", None, "take"),
+    ("take", "a\0b", "take"), ("take", "\ud800", "take"),
 ])  # fmt: skip
 def test_a_run_json_that_no_run_wrote(tmp_path: Path, name: str, value: object, said: str) -> None:
     store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 1, name: value})
     with pytest.raises(InputError, match=f"run.json is damaged: “{said}” is invalid; remove the file and run again"):
         Results(tmp_path).read_run()
+
+
+def test_arrays_that_were_changed_are_lost(tmp_path: Path) -> None:
+    """As many bytes as before, but other ones: the stage is done again, and nobody builds on them."""
+    results = Results(tmp_path)
+    store.save(tmp_path / "trajectories.npz", {"xyz_m": np.arange(3000.0)}, {})
+    (tmp_path / "motion.csv").write_text("frame\n0\n1\n")
+    results.write_run({})
+    assert lost(tmp_path, results.read_run()) == {}
+    check_complete(tmp_path, ("track", "fit"), all_there=True)
+    content = bytearray((tmp_path / "trajectories.npz").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "trajectories.npz").write_bytes(content)
+    assert lost(tmp_path, results.read_run()) == {"track": ["trajectories.npz"]}
+    check_complete(tmp_path)
+    with pytest.raises(InputError, match=r"^trajectories.npz in .* is missing, cut, changed, or lacks files; repeat the run"):
+        check_complete(tmp_path, of="trajectories.npz")
+    (tmp_path / "motion.csv").write_text("frame\n0\n")
+    with pytest.raises(InputError, match="^motion.csv in "):
+        check_complete(tmp_path)
+    (tmp_path / "motion.csv").unlink()
+    check_complete(tmp_path)  # who does not need it says what is missing
+    with pytest.raises(InputError, match="^motion.csv in "):
+        check_complete(tmp_path, all_there=True)
 
 
 def test_clouds_and_trajectories(tmp_path: Path) -> None:
@@ -161,7 +186,7 @@ def test_removing(tmp_path: Path) -> None:
 
 def test_what_was_written_and_is_gone_or_cut_is_known(tmp_path: Path) -> None:
     results = Results(tmp_path)
-    for name in ("clouds/0000.ply", "clouds/0001.ply", "joints.csv", "skin/rest.npz", "skin/texture.png", "report/report.html"):
+    for name in ("clouds/0000.ply", "clouds/0001.ply", "joints.csv", "skin/0000.ply", "skin/texture.png", "report/report.html"):
         store.write_bytes(tmp_path / name, b"some bytes")
     results.write_run({"stages": {}})
     run = results.read_run()

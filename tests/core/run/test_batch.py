@@ -164,6 +164,7 @@ def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, m
     assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9", "--quiet"]) == 2
     assert "No Dask scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err.splitlines()[-1]
     assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--workers", "0"]) == 2
+    assert capfd.readouterr().err == "tricap: --workers 0 is out of range; write 1 to 1000.\n"
 
 
 def test_names_of_results(tmp_path: Path) -> None:
