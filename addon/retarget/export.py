@@ -188,10 +188,10 @@ def _copy_ply(out: Path, folder: Path, of: str) -> str:
     files = files and [file for file in files if not file.stem.isdecimal() or first <= int(file.stem) < end]  # not a copy of the user's own
     if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
-    check_files(folder, PLY)
-    list_files(folder, PLY, [file.name for file in files])
     for file in files:
         read_ply(file)  # a damaged one is not spread
+    check_files(folder, PLY)
+    list_files(folder, PLY, [file.name for file in files])
     for file in files:
         store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"
