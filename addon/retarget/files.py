@@ -22,6 +22,7 @@ from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
+from ...core.results.folder import check_complete
 from ..scene.armature import ROLES_KEY, SNAPS_KEY
 from .build import build_armature
 from .programs import is_imported_by_blender
@@ -103,6 +104,8 @@ def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
     """
     bounded.check_name(path)
     if not is_imported_by_blender(path):
+        if path.is_dir():
+            check_complete(path)
         return read_motion_source(path, up=up, unit=unit)
     source = open_moving(path)
     return with_residual_motion(source, read_motion(source, read_rig(source), action_frames(source), monitor))

@@ -8,11 +8,11 @@ import numpy as np
 from ..body.shape import BodyShape, read_body
 from ..body.skeleton import bone_frames
 from ..foundation.errors import InputError
-from ..results.folder import check_complete
 from .formats.bvh import read_bvh
 from .formats.c3d import read_c3d
 from .formats.markers import Markers, metres_per, rate, read_points_csv
 from .formats.trc import read_trc
+from .plausible import check_places
 from .retarget.points import motion_from_points
 from .retarget.rig import Motion, Rig
 from .retarget.roles import model_roles
@@ -74,9 +74,9 @@ def from_run(out: Path) -> Motion:
     """
     if (out / "take.toml").is_file() and not (out / "body.toml").is_file():
         raise InputError(f"{out} is a take; give the folder with its results instead, which `tricap run` wrote.")
-    check_complete(out)
     shape = read_body(out / "body.toml")
     table = read_motion(out / "motion.csv", shape.skeleton)
+    check_places(table.values, f"{out / 'motion.csv'} is a motion")
     known = np.isfinite(table.values).all(axis=1)
     if not known.any():
         raise InputError(f"{out / 'motion.csv'} has no frame with a solution; run the fit again.")
