@@ -20,7 +20,7 @@ from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import is_of_points, read_motion_source, read_points
 from ...core.motion.tables import read_joints
-from ...core.results.folder import check_complete, check_not_result
+from ...core.results.folder import MADE_BY, check_complete, check_not_result
 from ...core.results.listed_files import PLY, check_files, list_files
 from ...core.results.outputs import check_output
 from ...core.results.own_files import files_of
@@ -51,8 +51,8 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
     if kind in BY_BLENDER:
         bounded.check_name(file)
-    if kind in BY_BLENDER and file.suffix.lower() not in ENDINGS[kind]:
-        raise InputError(f"{file.name} does not end in {' or '.join(ENDINGS[kind])}; write the name with that ending.")
+        if file.suffix.lower() not in ENDINGS[kind]:
+            raise InputError(f"{file.name} does not end in {' or '.join(ENDINGS[kind])}; write the name with that ending.")
     check_output(file, [] if out is None else [out])
     if file.name != named.name and file.exists():
         raise InputError(f"{file.name} exists already; write the name with its ending to replace it.")
@@ -79,10 +79,9 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
         from .read import ended
 
         return ended(exporting_played(open_moving(out), kind, file, preset, monitor))
-    of_body = kind != "ply" or of in ("", "skin")
-    check_complete(out, ("fit",) if of_body else (), of, all_there=True)
+    check_complete(out, [of] if kind == "ply" and of else MADE_BY["fit"])
     if kind == "ply":
-        return _copy_ply(out, file, of)
+        return _copy_ply(out, file, of, monitor)
     if kind in POINTS:
         moving = read_motion_source(out, up=up, unit=unit) if kind == "c3d" and _has_segments(out) else None
         return _write_points(kind, file, points_of(out, up=up, unit=unit), program, moving)
@@ -181,14 +180,15 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program, mov
     return f"{len(markers.names)} points in {len(markers.frames)} frames" + (f", {len(names)} segments" if segments else "")
 
 
-def _copy_ply(out: Path, folder: Path, of: str) -> str:
+def _copy_ply(out: Path, folder: Path, of: str, monitor: Monitor) -> str:
     """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
     first, end = (read_run(out / "run.json") if (out / "run.json").is_file() else {}).get("frames", (0, np.inf))
     files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := list(files_of(out / name, name)))), None)
     files = files and [file for file in files if not file.stem.isdecimal() or first <= int(file.stem) < end]  # not a copy of the user's own
     if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
-    for file in files:
+    for n, file in enumerate(files):
+        monitor.step("exporting", n, len(files))
         read_ply(file)  # a damaged one is not spread
     check_files(folder, PLY)
     list_files(folder, PLY, [file.name for file in files])

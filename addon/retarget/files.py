@@ -105,7 +105,7 @@ def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
     bounded.check_name(path)
     if not is_imported_by_blender(path):
         if path.is_dir():
-            check_complete(path)
+            check_complete(path, ("body.toml", "motion.csv"))
         return read_motion_source(path, up=up, unit=unit)
     source = open_moving(path)
     return with_residual_motion(source, read_motion(source, read_rig(source), action_frames(source), monitor))

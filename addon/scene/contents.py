@@ -31,6 +31,7 @@ from ...core.take.take import read_take
 from ...core.tracking.settings import TrackStatus
 from .prepare import Prepared, prepare
 
+TABLES = ("body.toml", "motion.csv", "joints.csv", "frames.csv")
 DEFAULT_FPS = 25.0  # of a scene whose take is missing
 
 
@@ -89,7 +90,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: 
     if not (out / "run.json").is_file():
         raise InputError(f"{out} has no results of Tricap (no run.json); choose the output folder of a run.")
     run = read_run(out / "run.json")
-    check_complete(out)
+    check_complete(out, [name for name in TABLES if (out / name).is_file()])
     warnings: list[str] = []
     footage = _footage(run, out, warnings)
     clouds = _clouds(out / "clouds", monitor, warnings)

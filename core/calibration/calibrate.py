@@ -42,6 +42,10 @@ MIN_PATH = 0.02  # of the image width: a bar that moves less is static
 MIN_STATIC = 4  # positions that show whether the bar moves
 LONGEST_BAR_M = 20.0
 SHORTEST_BAR_M = 0.005
+UNDETERMINED = (
+    "The image points do not determine the cameras; check that no camera was moved or turned while recording, that the sequences start "
+    "at the same instant, and that no view is mirrored."
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -156,7 +160,8 @@ def measure_bar(
     """
     if not (math.isfinite(length_m) and SHORTEST_BAR_M <= length_m < LONGEST_BAR_M):
         raise InputError(
-            f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
+            f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6 "
+            f"({SHORTEST_BAR_M:g} to {LONGEST_BAR_M:g})."
         )
     if diameter_m is not None and not 0 < diameter_m < length_m:
         raise InputError(f"The targets' diameter is given as {diameter_m:g} m; it must lie between 0 and the bar's length, {length_m:g} m.")
@@ -275,11 +280,11 @@ def calibrate_rig(
         verdict.refuse_same_footage(seen)
     try:
         calibration = _adjusted(observations, monitor, focal_px, lens)
+        verdict.refuse_if_useless(calibration)
+        calibration = in_world(calibration, world)
+        quality = assess(calibration, monitor)
     except np.linalg.LinAlgError as error:
-        raise InputError(verdict.UNDETERMINED) from error
-    verdict.refuse_if_useless(calibration)
-    calibration = in_world(calibration, world)
-    quality = assess(calibration, monitor)
+        raise InputError(UNDETERMINED) from error
     verdict.refuse_if_undetermined(calibration, quality)
     judged = verdict.judge(calibration, quality)
     metadata = {

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from ..foundation.errors import InputError
+from ..geometry.robust import masked_median
 from .network import Observations
 from .quality import Quality
 from .self_calibration import Calibration
@@ -52,10 +53,6 @@ WORDS: Mapping[str, Mapping[str, str]] = {
 
 
 SAME_FOOTAGE_PX = 0.5  # between the image points of two views: a copy that was encoded anew
-UNDETERMINED = (
-    "The image points do not determine the cameras; check that no camera was moved or turned while recording, that the sequences start "
-    "at the same instant, and that no view is mirrored."
-)
 
 
 class Light(StrEnum):
@@ -84,18 +81,22 @@ def positions_used(calibration: Calibration) -> int:
 
 
 def refuse_same_footage(observations: Observations) -> None:
-    """Raise InputError if two cameras show the same image points in all positions.
+    """Check that no two cameras show the object at the same pixels.
 
     Raises:
-        InputError: two views have the same footage.
+        InputError: two do.
     """
-    xy = np.sort(observations.xy_px, axis=2)  # either end of a bar may be the first
+    xy = observations.xy_px
     for i, j in combinations(range(len(observations.names)), 2):
-        apart = np.abs(xy[:, i] - xy[:, j]).max(axis=(1, 2))
+        either = [np.linalg.norm(xy[:, i] - xy[:, j, ::way], axis=-1) for way in (1, -1)]  # the ends of a bar are in any order
+        both = np.isfinite(either)
+        apart = np.where(both.any(axis=2), masked_median(np.array(either), both), np.inf).min(axis=0)
         shared = apart[np.isfinite(apart)]
         if len(shared) >= observations.fewest_positions and np.median(shared) < SAME_FOOTAGE_PX:
             a, b = observations.names[i], observations.names[j]
-            raise InputError(f"Views {a} and {b} show the same footage; give each view the images of its own camera.")
+            raise InputError(
+                f"Views {a} and {b} show the same footage of the {observations.noun}; give each view the images of its own camera."
+            )
 
 
 def refuse_if_useless(calibration: Calibration) -> None:
@@ -160,13 +161,13 @@ def judge(calibration: Calibration, quality: Quality) -> Verdict:
     doubt = calibration.doubt or _contradiction(calibration, quality)
     if doubt and light is Light.GREEN:
         light = Light.YELLOW
-    light = light if calibration.converged else Light.RED
+    caution = ""
+    if not calibration.converged:
+        light, caution = Light.RED, "The adjustment did not converge, so its figures may be too good. "
     sentence = (
-        f"{LIGHT_WORDS[light]}: the cameras place points within {_mm(error)} (RMS) in the {size} m {words['where']}, "
+        f"{caution}{LIGHT_WORDS[light]}: the cameras place points within {_mm(error)} (RMS) in the {size} m {words['where']}, "
         f"{distance:.1f} m away; {words['tested']} is right within {_ended(_mm(tested.rms_m) + (', but ' + doubt if doubt else ''))}"
     )
-    if not calibration.converged:
-        sentence = f"The adjustment did not converge, so its figures may be too good. {sentence}"
     return Verdict(light=light, sentence=sentence, advice=advice(calibration, quality))
 
 

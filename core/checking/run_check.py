@@ -96,7 +96,7 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
         if gone:
             findings.append(wrong(Cause.FILES_MISSING, f"{', '.join(gone)} of the stage “{stage}” is missing in {folder}.", again))
         if less:
-            sentence = f"{', '.join(less)} of the stage “{stage}” in {folder} is missing, cut, changed, or lacks files."
+            sentence = f"{', '.join(less)} of the stage “{stage}” in {folder} is missing, cut, damaged, or lacks files."
             findings.append(wrong(Cause.FILES_MISSING, sentence, again))
     if fault := blend_file.lacking(folder, run):
         findings.append(wrong(Cause.FILES_MISSING, f"{blend_file.BLEND} in {folder} {fault}.", again))

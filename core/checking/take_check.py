@@ -11,6 +11,7 @@ import numpy as np
 from ..body.model_file import read_model
 from ..fitting.inputs.take_inputs import clicks_of_no_joint
 from ..fitting.settings import START_ALONE, FitSettings
+from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
@@ -277,17 +278,13 @@ def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
 
 
 def _own_backgrounds(footage: Footage) -> list[Finding]:
-    """Backgrounds that are images of their own view: whoever is in such an image is background there."""
-    given = [(view, sequence.files()) for view, sequence in zip(footage.take.views, footage.sequences) if view.background is not None]
-    return [
-        doubtful(
-            Cause.BACKGROUND,
-            f"The background of view {view.name}, {view.background}, is an image of this view: nobody is found there in that frame.",
-            "That is right if nobody is in it; otherwise take an image of the empty room.",
-        )
-        for view, files in given
-        if footage.take.folder / str(view.background) in files
-    ]
+    """A finding for each background that is an image of its own view: whoever it shows counts as background."""
+    advice, findings = "That is right if it shows nobody; otherwise take an image of the empty room.", []
+    for view, sequence in zip(footage.take.views, footage.sequences):
+        if view.background and real_path(footage.take.folder / view.background) in map(real_path, sequence.files()):
+            what = f"The background of view {view.name}, {view.background}, is an image of this view"
+            findings.append(doubtful(Cause.BACKGROUND, f"{what}: whoever it shows counts as background.", advice))
+    return findings
 
 
 def check_first_frame(footage: Footage, frame: int) -> list[Finding]:

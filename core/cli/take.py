@@ -29,8 +29,6 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     for (name, _), source in zip(views, sources):
         if sources.count(source) > 1:
             raise InputError(f"View {name} has the same footage as another view, {source}; give each view the footage of its own camera.")
-        if Path(source).is_dir() and real_path(folder).is_relative_to(source):
-            raise InputError(f"{folder} holds the footage of view {name}, or lies in it; give a folder of its own for the take.")
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     stated = [rate for _, source in links if not source.is_dir() and (rate := round(movie_rate(source), 6)) > 0]
     fps = args.fps if args.fps is not None else next(iter(stated), ASSUMED_FPS)

@@ -35,6 +35,7 @@ UNDISTORT_STEPS = 12  # of Newton's method
 UNDISTORT_TOLERANCE = 1e-12  # of normalised coordinates
 SAME_PX = 0.01
 NEAREST_M = 1e-6  # in front of the camera
+ROUNDED = 1e-6
 LARGEST_SKEW = 0.05  # of a focal length: rows of pixels that are turned by 3 degrees against their columns
 
 
@@ -176,9 +177,10 @@ class Camera:
 
 
 def is_camera_matrix(matrix: np.ndarray) -> bool:
-    """Whether a matrix (3, 3) can be that of a camera."""
+    """Whether a matrix (3, 3) can be that of a camera, but for rounding: an upper triangle with 1 at its end and hardly any skew."""
     fx, fy = matrix[0, 0], matrix[1, 1]
-    return bool(fx > 0 and fy > 0 and abs(matrix[0, 1]) <= LARGEST_SKEW * fx and matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1])
+    rounded = abs(matrix[1, 0]) <= ROUNDED * fx and np.allclose(matrix[2], [0, 0, 1], rtol=0, atol=ROUNDED)
+    return bool(fx > 0 and fy > 0 and abs(matrix[0, 1]) <= LARGEST_SKEW * fx and rounded)
 
 
 def project_all(cameras: Sequence[Camera], xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

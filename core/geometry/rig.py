@@ -204,7 +204,8 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
         model = "a fisheye lens has k1, k2, k3, k4" if fisheye else "this model has k1, k2, p1, p2, k3"
         raise InputError(f"{label} has {given.size} distortions; {model}.")
     distortions[: len(given)] = given
-    if not is_camera_matrix(matrix) or min(size) < 8:
+    upright = matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1]
+    if not upright or not is_camera_matrix(matrix) or min(size) < 8:
         raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
     affinity = _array(entry, "affinity", (2,), label) if "affinity" in entry else np.zeros(2)
     return Camera(

@@ -215,33 +215,30 @@ class FitCheckpoints:
         self._results.save_checkpoint(self._folder, name, self._key, arrays)
 
 
-def lost(folder: Path, run: Mapping[str, Any]) -> dict[str, list[str]]:
-    """By stage, the results in a folder that have fewer files or bytes than when run.json was written (that of an earlier version does not
-    know), or arrays that were changed since."""
+def lost(folder: Path, run: Mapping[str, Any], among: Iterable[str] | None = None) -> dict[str, list[str]]:
+    """By stage, the results in a folder, all of them or those `among` some, that have fewer files or bytes than when run.json was written,
+    or arrays (.npz) with another content. The run.json of earlier versions has no sizes to compare."""
     then, found = run.get("files", {}), dict[str, list[str]]()
     for stage, names in MADE_BY.items():
-        fewer = [
-            name
-            for name in names
-            if name in then and (any(now < was for now, was in zip(_size(folder / name), then[name])) or _is_damaged(folder / name))
+        known = [name for name in names if name in then and (among is None or name in among)]
+        less = [
+            name for name in known if any(now < was for now, was in zip(_size(folder / name), then[name])) or _is_damaged(folder / name)
         ]
-        if fewer:
-            found[stage] = fewer
+        if less:
+            found[stage] = less
     return found
 
 
-def check_complete(folder: Path, stages: Iterable[str] = ("fit",), of: str = "", *, all_there: bool = False) -> None:
-    """Check that the results of some stages, or those called `of`, are as their run wrote them, as far as they are there, or `all_there`.
+def check_complete(folder: Path, names: Iterable[str]) -> None:
+    """Check that some results in the folder of a run are as the run wrote them.
 
     Raises:
-        InputError: some are cut or changed, or missing.
+        InputError: one is missing, cut or damaged; or run.json is.
     """
     run = run_json.read_run(folder / "run.json") if (folder / "run.json").is_file() else {}
-    for stage, names in lost(folder, run).items():
-        found = [name for name in names if all_there or (folder / name).exists()]
-        if of in found or (found and stage in stages):
-            what = f"{', '.join(found)} in {folder}"
-            raise InputError(f"{what} is missing, cut, changed, or lacks files; repeat the run, which makes it again.")
+    if less := [name for of_stage in lost(folder, run, [*names]).values() for name in of_stage]:
+        what = f"{', '.join(less)} in {folder}"
+        raise InputError(f"{what} is missing, cut, damaged, or lacks files; repeat the run, which makes it again.")
 
 
 def _files(path: Path) -> Iterable[Path]:

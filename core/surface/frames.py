@@ -6,6 +6,7 @@ frame is measured.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from statistics import median_low
 from typing import overload
 
 import numpy as np
@@ -81,7 +82,7 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
     @property
     def smoothed_px(self) -> float:
         """The sigma of the Gaussian that took noise away in most of the frames, or 0."""
-        return sorted(s.smoothed_px for s in self.summaries)[len(self) // 2]
+        return median_low([s.smoothed_px for s in self.summaries]) if self.summaries else 0.0
 
     def clouds(self, corrected: Callable[[PointCloud], PointCloud]) -> Sequence[PointCloud]:
         """The frames' clouds, each read and corrected on access."""

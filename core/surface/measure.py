@@ -122,7 +122,7 @@ def _refused_by_a_view(measured: MeasuredFrame, settings: MeasureSettings) -> bo
 
 def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, monitor: Monitor) -> MeasuredFrame:
     """The surface of a frame from its start."""
-    smoothed_px = _noise_px(now, start.seeds, settings)
+    smoothed_px = _smoothing_px(now, start.seeds, settings)
     now = replace(now, views=now.views.smoothed(smoothed_px)) if smoothed_px else now
     views, ref, where = now.views, now.views.reference, replace(start.where, silhouettes=now.silhouettes)
     field = _matched(now, start.seeds, settings, where, monitor)
@@ -150,8 +150,8 @@ def _measure(now: FrameViews, settings: MeasureSettings, start: FrameStart, moni
     )
 
 
-def _noise_px(now: FrameViews, seeds: Approximations, settings: MeasureSettings) -> float:
-    """By how much the views are smoothed before they are matched: where noise hides the texture, so that clearly more seeds match then."""
+def _smoothing_px(now: FrameViews, seeds: Approximations, settings: MeasureSettings) -> float:
+    """The sigma of the Gaussian before the views are matched: 0, unless noise hides the texture and clearly more seeds match with one."""
     if settings.growing.method == "published" or not len(seeds.depth_m):
         return 0.0
     smooth = now.views.smoothed(NOISE_PX)
@@ -252,5 +252,5 @@ def _measured(footage: Footage, frame: int, key: str, a: dict[str, np.ndarray]) 
         key=key,
         removed_px=removed,
         removed_why=why,
-        smoothed_px=float(a.get("smoothed_px", 0.0)),
+        smoothed_px=float(a["smoothed_px"]),
     )

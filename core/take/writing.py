@@ -127,12 +127,14 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
     """The entry of [[views]] for footage, a movie or a folder of images, and the link into the take's folder that it needs.
 
     Raises:
-        InputError: the footage is missing, or another file has its name in the folder.
+        InputError: the footage is missing, holds the folder, or another file has its name in the folder.
     """
     if not source.exists():
         whole = f" (for a pattern give its folder, {source.parent})" if "*" in source.name else ""
         raise InputError(f"The footage {source} of view {name} is missing; check the path{whole}.")
     if source.is_dir():
+        if bounded.real_path(folder).is_relative_to(bounded.real_path(source)):
+            raise InputError(f"{folder} is the folder of the images of view {name}, or lies in it; choose another folder for the take.")
         endings = sorted({p.suffix for p in source.iterdir() if p.suffix.lower() in IMAGE_ENDINGS})
         if len(endings) != 1:
             raise InputError(

@@ -161,7 +161,7 @@ class TrackingRules:
 
     @staticmethod
     def of(settings: Mapping[str, Any], measured: MeasuredFrames) -> "TrackingRules":
-        """Those of settings by group, for frames that were measured."""
+        """Those of settings by group, for measured frames."""
         return TrackingRules(
             matching=settings["matching"],
             tracking=settings["tracking"],
@@ -250,7 +250,7 @@ def track_frames(
 
 
 def _images(footage: Footage, frame: int, rules: TrackingRules) -> FrameImages:
-    """Read a frame for tracking: without its noise and its shading, unless tracking is that of the papers."""
+    """Read a frame for tracking: smoothed as the surface was measured, and without shading, unless tracking is that of the papers."""
     images = load_images(footage, frame, rules.enhance)
     if rules.tracking.scheme != "space":
         return images

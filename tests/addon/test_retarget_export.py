@@ -215,7 +215,7 @@ def test_results_that_are_gone_are_not_left_out_in_silence(empty: ModuleType, sm
     Results(out).write_run(json.loads((out / "run.json").read_text()))
     shutil.rmtree(out / "skin")
     for kind in ("fbx", "bvh", "ply"):
-        with pytest.raises(InputError, match="^skin in .* is missing, cut, changed, or lacks files; repeat the run"):
+        with pytest.raises(InputError, match="^skin in .* is missing, cut, damaged, or lacks files; repeat the run"):
             export_file(out, kind, tmp_path / f"a.{kind}", "plain", Monitor())
     assert "files from clouds/" in export_file(out, "ply", tmp_path / "ply", "plain", Monitor(), of="clouds")
 

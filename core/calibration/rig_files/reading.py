@@ -15,7 +15,7 @@ import numpy as np
 
 from ...foundation import bounded
 from ...foundation.errors import InputError
-from ...geometry.camera import Camera, is_camera_matrix
+from ...geometry.camera import LARGEST_SKEW, Camera, is_camera_matrix
 from ...geometry.rig import LARGEST_NUMBER
 from ...geometry.rotation import rotation_from_vector
 
@@ -80,10 +80,14 @@ def make_camera(
     """A camera, checked.
 
     Raises:
-        InputError: it is impossible: no focal length, no size, a matrix that does not turn.
+        InputError: it is impossible: no focal length, no size, a large skew, a matrix that is none of a camera or does not turn.
     """
     if not is_camera_matrix(matrix) or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
-        raise InputError(f"Camera “{name}” has an impossible matrix or size; the file is damaged.")
+        raise InputError(
+            f"Camera “{name}” has an impossible matrix or size: focal lengths must be positive, the last row 0, 0, 1, and the skew at most "
+            f"{LARGEST_SKEW:g} of the focal length."
+        )
+    matrix = np.array([[matrix[0, 0], *matrix[0, 1:]], [0.0, *matrix[1, 1:]], [0.0, 0.0, 1.0]])  # without what was rounded
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")
     return Camera(

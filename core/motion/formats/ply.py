@@ -34,6 +34,7 @@ KINDS = {
     "float64": "<f8",
 }
 LONGEST_HEADER = 65536
+LINES_AFTER = 64  # bytes behind the last element that may be line ends only
 END = b"end_header\n"
 
 
@@ -137,8 +138,8 @@ def read_ply(path: Path) -> Ply:
     """Read a binary little-endian PLY file.
 
     Raises:
-        InputError: it cannot be read, is not such a file, is not as long as its header says, has vertices without a place, or its faces
-            name missing vertices.
+        InputError: it cannot be read, is not such a file, is not as long as its header says, has vertices without coordinates, or its
+            faces name missing vertices.
     """
     try:
         data = bounded.bytes_of(path, bounded.ARRAYS_BYTES)
@@ -156,11 +157,11 @@ def read_ply(path: Path) -> Ply:
             vertex = {name: rows[name].copy() for name, _ in element.scalars}
     if not {"x", "y", "z"} <= set(vertex):
         raise InputError(f"{path} has no vertices with x, y and z; export it again as a point cloud or mesh.")
-    if data[position:].strip():
+    if data[position : position + LINES_AFTER].strip():
         raise InputError(f"{path} is longer than its header says; it is damaged, export it again.")
     n = len(vertex["x"])
     if not all(np.isfinite(vertex[axis]).all() for axis in "xyz"):
-        raise InputError(f"{path} has vertices without a place (NaN or infinite); it is damaged, export it again.")
+        raise InputError(f"{path} has vertices without coordinates (NaN or infinite); export it without them.")
     if faces.size and faces.max() >= n:
         raise InputError(f"{path} has faces that name vertices beyond its {n}; it is damaged, export it again.")
     return Ply(vertex=vertex, faces=faces)

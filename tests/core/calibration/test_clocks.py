@@ -77,12 +77,17 @@ def test_three_rates_calibrate_as_well_as_one() -> None:
 
 def test_two_views_of_the_same_footage_and_cameras_that_are_not_determined_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     bars = of_rates(benchmark_cameras(), np.full(3, 24.0), np.zeros(3), np.zeros(3))
+    noise_px = np.random.default_rng(0).normal(0, 0.05, bars.xy_px[:, 0].shape)
     turned = np.array(bars.xy_px)
-    turned[:, 2] = turned[:, 0, ::-1] + np.random.default_rng(0).normal(
-        0, 0.05, turned[:, 0].shape
-    )  # encoded anew, ends in the other order
-    with pytest.raises(InputError, match="^Views L and R show the same footage; give each view the images of its own camera"):
+    turned[:, 2] = turned[:, 0, ::-1] + noise_px  # encoded anew, with the ends in the other order
+    with pytest.raises(InputError, match="^Views L and R show the same footage of the bar; give each view the images of its own camera"):
         calibrate_rig(replace(bars, xy_px=turned), Monitor())
+    held = observed_boards(waved_board(benchmark_cameras()[:2], CHESSBOARD.corners_m, 60, np.random.default_rng(2), delay_images=[0.0] * 2))
+    same = np.array(held.xy_px)
+    same[:, 1] = same[:, 0]
+    same[:, 1, 3] = np.nan  # a corner that one view never shows
+    with pytest.raises(InputError, match="show the same footage of the board"):
+        calibrate_rig(replace(held, xy_px=same), Monitor())
 
     def fails(*args: object) -> None:
         raise np.linalg.LinAlgError("Eigenvalues did not converge")

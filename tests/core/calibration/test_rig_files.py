@@ -102,6 +102,18 @@ error = 0.43
 """
 
 
+def test_a_matrix_may_be_rounded_but_not_skew(tmp_path: Path) -> None:
+    rounded = "[ [ 900.5, 0.5, 639.5,], [ 1e-10, 900.5, 359.5,], [ -1e-17, 0.0, 1.000000000001,],]"
+    path, first = tmp_path / "calibration.toml", ANIPOSE.index("matrix = ") + len("matrix = ")
+    end = ANIPOSE.index("\n", first)
+    path.write_text(ANIPOSE[:first] + rounded + ANIPOSE[end:])
+    assert read_any(path)["A"].matrix.tolist() == [[900.5, 0.5, 639.5], [0, 900.5, 359.5], [0, 0, 1]]
+    for wrong in (rounded.replace("0.5, 639", "100.0, 639"), rounded.replace("1.000000000001", "2.0")):
+        path.write_text(ANIPOSE[:first] + wrong + ANIPOSE[end:])
+        with pytest.raises(InputError, match="Camera “A” has an impossible matrix or size: .* the skew at most 0.05 of the focal length"):
+            read_any(path)
+
+
 def test_anipose_file(tmp_path: Path) -> None:
     """As aniposelib's CameraGroup.dump writes it: a table of Camera.get_dict() per camera, [metadata] (aniposelib/cameras.py)."""
     path = tmp_path / "calibration.toml"

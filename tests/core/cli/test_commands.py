@@ -402,7 +402,7 @@ NEW_FAULTS = {
     "missing": (["L={t}/L", "C={t}/missing.mp4"], [], "missing.mp4 of view C is missing"),
     "pattern": (["L={t}/L", "C={t}/C/*.png"], [], "for a pattern give its folder"),
     "twice": (["L={t}/L", "C={t}/C/../L"], [], "View L has the same footage as another"),
-    "in the footage": (["L={t}/..", "C={t}/C"], [], "made holds the footage of view L, or lies in it"),
+    "in the footage": (["L={t}/..", "C={t}/C"], [], "made is the folder of the images of view L, or lies in it"),
     "no images": (["L={t}/L", "C={t}"], [], "has no images"),
     "one view": (["L={t}/L"], [], "needs at least two"),
     "two alike": (["L={t}/L", "L={t}/C"], [], "have the same name"),

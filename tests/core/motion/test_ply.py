@@ -35,11 +35,11 @@ def test_more_of_a_cloud_follows_what_every_cloud_has(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", [np.nan, np.inf])
-def test_points_without_a_place_and_more_bytes_than_promised_are_refused(tmp_path: Path, place: float) -> None:
+def test_vertices_without_coordinates_and_more_bytes_than_promised_are_refused(tmp_path: Path, place: float) -> None:
     given = cloud(4)
     given["xyz_m"][2, 1] = place
     write_cloud(tmp_path / "0000.ply", **given)
-    with pytest.raises(InputError, match="0000.ply has vertices without a place"):
+    with pytest.raises(InputError, match="0000.ply has vertices without coordinates"):
         read_ply(tmp_path / "0000.ply")
     write_cloud(tmp_path / "0001.ply", **cloud(4))
     whole = (tmp_path / "0001.ply").read_bytes()

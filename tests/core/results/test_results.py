@@ -133,21 +133,18 @@ def test_arrays_that_were_changed_are_lost(tmp_path: Path) -> None:
     (tmp_path / "motion.csv").write_text("frame\n0\n1\n")
     results.write_run({})
     assert lost(tmp_path, results.read_run()) == {}
-    check_complete(tmp_path, ("track", "fit"), all_there=True)
+    check_complete(tmp_path, ("trajectories.npz", "motion.csv"))
     content = bytearray((tmp_path / "trajectories.npz").read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "trajectories.npz").write_bytes(content)
     assert lost(tmp_path, results.read_run()) == {"track": ["trajectories.npz"]}
-    check_complete(tmp_path)
-    with pytest.raises(InputError, match=r"^trajectories.npz in .* is missing, cut, changed, or lacks files; repeat the run"):
-        check_complete(tmp_path, of="trajectories.npz")
-    (tmp_path / "motion.csv").write_text("frame\n0\n")
-    with pytest.raises(InputError, match="^motion.csv in "):
-        check_complete(tmp_path)
-    (tmp_path / "motion.csv").unlink()
-    check_complete(tmp_path)  # who does not need it says what is missing
-    with pytest.raises(InputError, match="^motion.csv in "):
-        check_complete(tmp_path, all_there=True)
+    check_complete(tmp_path, ("motion.csv", "never made"))
+    with pytest.raises(InputError, match=r"^trajectories.npz in .* is missing, cut, damaged, or lacks files; repeat the run"):
+        check_complete(tmp_path, ("motion.csv", "trajectories.npz"))
+    for damage in (lambda file: file.write_text("frame\n0\n"), Path.unlink):
+        damage(tmp_path / "motion.csv")
+        with pytest.raises(InputError, match="^motion.csv in "):
+            check_complete(tmp_path, ("motion.csv",))
 
 
 def test_clouds_and_trajectories(tmp_path: Path) -> None:
