@@ -87,7 +87,7 @@ def make_camera(
             f"Camera “{name}” has an impossible matrix or size: focal lengths must be positive, the last row 0, 0, 1, and the skew at most "
             f"{LARGEST_SKEW:g} of the focal length."
         )
-    matrix = np.array([[matrix[0, 0], *matrix[0, 1:]], [0.0, *matrix[1, 1:]], [0.0, 0.0, 1.0]])  # without what was rounded
+    matrix = np.vstack([np.triu(matrix)[:2], [0.0, 0.0, 1.0]])  # without what was rounded
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")
     return Camera(
