@@ -51,6 +51,7 @@ def test_only_input_errors_come_out_of_damaged_files(tmp_path: Path) -> None:
     assert sum(row["refused"] for row in said) > 0.4 * COUNT * len(said)  # the damage is real
 
 
+@pytest.mark.slow
 def test_a_faulty_reader_is_found(tmp_path: Path) -> None:
     """The engine itself: readers that raise something else, that are slow, that take memory, and that crash."""
     said, died = fuzz(tmp_path, 2, "test raises", "test sleeps", "test swells", "test dies")

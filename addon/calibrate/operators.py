@@ -11,7 +11,7 @@ import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ...core.calibration.boards.board import Board, BoardKind, Lens, write_board
-from ...core.calibration.rig_files import FORMATS, read_any, write_as
+from ...core.calibration.rig_files import FORMATS, lens_note, read_any, write_as
 from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
@@ -300,11 +300,12 @@ class ExportRig(TellingOperator, ExportHelper, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Read the scene and write the file."""
         rig, path = rig_of_scene(context.scene), folders.to_write(self.filepath)
+        said = f"{len(rig.cameras)} cameras in {path}."
         if self.layout_name == "tricap":
             write_rig(path, rig)
-        else:
-            write_as(path, rig, self.layout_name)
-        return f"{len(rig.cameras)} cameras in {path}."
+            return said
+        write_as(path, rig, self.layout_name)
+        return f"{said} {lens_note(path, rig, self.layout_name)}".strip()
 
 
 CLASSES = (Calibrate, PrintBoard, ImportRig, ExportRig)

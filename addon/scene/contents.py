@@ -156,9 +156,14 @@ def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage 
 
 
 def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Ply]:
-    files = {int(path.stem): path for path in sorted(folder.glob("*.ply")) if path.stem.isdecimal()}
+    missing = f"{folder} has no clouds"
+    try:
+        paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        paths, missing = [], f"cannot read {folder}: {error.strerror or error}"
+    files = {int(path.stem): path for path in paths if path.suffix == ".ply" and path.stem.isdecimal()}
     if not files:
-        warnings.append(f"No point cloud in the scene: {folder} has no clouds.")
+        warnings.append(f"No point cloud in the scene: {missing}.")
     clouds = {}
     for i, (frame, path) in enumerate(sorted(files.items())):
         monitor.step("reading clouds", i, len(files))

@@ -279,6 +279,8 @@ def _shape(table: dict[str, Any]) -> BodyShape:
     if not ((lengths_m >= LENGTHS_M[0]) & (lengths_m <= LENGTHS_M[1])).all():
         raise ValueError(f"length_m: {LENGTHS_M[0]:g} to {LENGTHS_M[1]:g} m are possible")
     names, balls = [bone.name for bone in bones], table.get("metaballs", [])
+    if homeless := {str(t["bone"]) for t in balls} - {*names}:
+        raise ValueError(f"a metaball belongs to the bone “{min(homeless)[:40]}”, which does not exist")
     metaballs = Metaballs(
         bone_index=np.array([names.index(t["bone"]) for t in balls], dtype=np.intp),
         centre=np.array([t["centre"] for t in balls], dtype=float).reshape(-1, 3),

@@ -13,12 +13,12 @@ from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import Start, Starts, calibrate_rig, check_report, measure_bar, open_bar, open_boards, write_report
-from ..calibration.rig_files import FOLDERS, read_any, write_as
+from ..calibration.rig_files import FOLDERS, lens_note, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..geometry.rig import read_rig, write_rig
+from ..geometry.rig import Rig, read_rig, write_rig
 from ..images.interlace import BOTH
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
 from ..results.listed_files import check_files
@@ -117,7 +117,14 @@ def _convert(args: argparse.Namespace) -> list[str]:
     if not args.format:
         write_rig(args.out, rig)
     lines = [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
-    return [*lines, f"The scale of {args.source}: {rig.metadata['scale']}."] if "scale" in rig.metadata else lines
+    if "scale" in rig.metadata:
+        lines.append(f"The scale of {args.source}: {rig.metadata['scale']}.")
+    return [*lines, *_lens_notes(args, rig)]
+
+
+def _lens_notes(args: argparse.Namespace, rig: Rig) -> list[str]:
+    note = lens_note(args.out, rig, args.format) if args.format else ""
+    return [note] if note else []
 
 
 def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> list[str]:
@@ -158,6 +165,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         result.verdict.sentence,
         f"To improve: {result.verdict.advice}.",
         *remarks,
+        *_lens_notes(args, result.rig),
         f"Written: {', '.join(map(str, written))}",
     ]
 

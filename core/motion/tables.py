@@ -98,6 +98,7 @@ def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
     names = skeleton.dof_names
     columns = [_column(header, name, path) for name in ("frame", "time_s", *names, *(f"sigma {name}" for name in names))]
     table = np.array([[_number(row[c], path, line) for c in columns] for line, row in enumerate(rows, 2)]).reshape(-1, len(columns))
+    _check_sigmas(table[:, 2 + len(names) :], path)
     check_times(table[:, 0], 1.0, f"{path} has rows")
     d, factor = len(names), _to_file(skeleton, names)
     return MotionTable(
@@ -128,6 +129,7 @@ def read_joints(path: Path) -> JointTable:
     frames = sorted(times)
     check_sparse(len(rows), len(frames), len(found), path)
     tables = {joint: np.array([places.get(f, [np.nan] * 5) for f in frames]) for joint, places in found.items()}
+    _check_sigmas(np.array([*tables.values()]).reshape(-1, 5)[:, 3:], path)
     return JointTable(
         frames=np.array(frames, dtype=np.int64),
         time_s=np.array([times[f] for f in frames]),
@@ -204,6 +206,11 @@ def _whole(text: str, path: Path, line: int) -> int:
     if not abs(value) < LARGEST_FRAME:
         raise InputError(f"Row {line} of {path} has the frame number {text[:40]}; run the fit again.")
     return int(value)
+
+
+def _check_sigmas(sigma: np.ndarray, path: Path) -> None:
+    if (sigma < 0).any():
+        raise InputError(f"{path} has a negative sigma ({sigma.min():g}), which no run writes; run the fit again.")
 
 
 def _number(text: str, path: Path, line: int) -> float:

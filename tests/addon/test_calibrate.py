@@ -31,6 +31,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     props = empty.context.scene.tricap_calibrate
     props.bar, props.length_m = str(bar), 0.5
@@ -51,6 +52,7 @@ def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     assert rig["C"].size_px == tuple(clip.size)
 
 
+@pytest.mark.slow
 def test_cameras_that_were_started_one_by_one(blender, empty, bar: Path, tmp_path: Path) -> None:
     """R began three images after the others; its sound says so."""
     room = world(12.0)
@@ -88,6 +90,7 @@ def test_cameras_at_different_rates(blender, empty, bar: Path, tmp_path: Path) -
     assert read_rig(tmp_path / "rig.toml").metadata["positions"] <= FRAMES // 2
 
 
+@pytest.mark.slow
 def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_path: Path) -> None:
     """The bar stands in both fields of these images, so twice as many frames are measured as the clip has."""
     props = empty.context.scene.tricap_calibrate
@@ -172,6 +175,7 @@ def test_an_own_camera_of_blender(blender, empty, tmp_path: Path) -> None:
     assert read.project(np.array([1.0, 0.5, 0.0])) == pytest.approx([959.5 + 2666.667 / 5, 539.5 - 2666.667 / 10], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_rig_calibrated_anew_stays_where_the_scene_has_it(blender, empty, bar: Path, tmp_path: Path) -> None:
     empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)
     cameras = {o["tricap_view"]: o for o in empty.context.scene.objects if o.type == "CAMERA"}
@@ -324,6 +328,7 @@ def test_undo_takes_calibrated_and_imported_cameras_away(blender, empty, bar: Pa
         empty.ops.ed.undo()
 
 
+@pytest.mark.slow
 def test_a_board_becomes_cameras_and_a_page(blender, empty, tmp_path: Path) -> None:
     props = empty.context.scene.tricap_calibrate
     props.target, props.squares, props.square_m, props.dictionary = "charuco", (5, 4), 0.14, "DICT_5X5_100"

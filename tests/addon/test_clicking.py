@@ -59,6 +59,7 @@ def sleeve_point(session: Any, truth: Truth, which: int) -> np.ndarray:
     return truth.vertices_m[session.frame, np.random.default_rng(8).permutation(rows)[which]]
 
 
+@pytest.mark.slow
 def test_a_click_gives_lines_and_a_proposal_that_is_right(session: Any, truth: Truth) -> None:
     session.depths_m.clear()  # as of points on the surface
     assert session.names == ["shoulder.R", "elbow.R", "wrist.R"] and session.name == "shoulder.R"

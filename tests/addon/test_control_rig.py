@@ -190,6 +190,7 @@ def test_snapping_with_keys_changes_no_other_frame(blender: ModuleType) -> None:
     assert switches(scene, rig, "thigh.R") == [0.0] + [1.0] * 5 + [0.0] + [1.0] * 5
 
 
+@pytest.mark.slow
 def test_limbs_are_snapped_over_the_frames_that_are_played(blender: ModuleType) -> None:
     """To IK in the preview range, where a foot is then moved, and back to FK with this correction."""
     body, scene = corrected(blender), blender.context.scene

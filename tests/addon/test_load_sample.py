@@ -40,6 +40,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_finished_project_is_opened_beside_the_file(blender: ModuleType, saved: Path, quick: list[list[str]]) -> None:
     assert blender.ops.tricap.load_sample() == {"FINISHED"} and not quick, "nothing is computed"
     scene = blender.context.scene

@@ -222,6 +222,7 @@ def lit(picture: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
     return picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3).max(axis=0)
 
 
+@pytest.mark.slow
 def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> None:
     assert drawn().max() == 0.0, "everything is off"
     picture = drawn(points=True, most_sigma_mm=2.0)

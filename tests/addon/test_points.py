@@ -60,6 +60,7 @@ def click(blender: ModuleType, scene: Any, truth: Truth, name: str, vertex: int,
         assert blender.ops.tricap.click_point(name=name, clip=view, x=x, y=y) == {"FINISHED"}
 
 
+@pytest.mark.slow
 def test_points_are_followed_in_space(blender: ModuleType, scene: Any, truth: Truth, tmp_path: Path) -> None:
     """Clicked in frame 1 in two views, they are followed to both ends; the empties are where the cloth is, the arrows have its speed."""
     vertices = {"nose": cloth(truth, 1, 0), "point 1": cloth(truth, 1, 1)}

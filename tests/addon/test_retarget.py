@@ -390,6 +390,7 @@ def test_our_own_armature_says_what_its_bones_are(empty: ModuleType) -> None:
     assert onto(target, squat(person(), frames=8)).figures.direction_rms_deg < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_real_rigs_walk_and_jump(empty: ModuleType, rig: str, tmp_path: Path) -> None:
     if not (SHARED / "rigs" / rig).is_file():

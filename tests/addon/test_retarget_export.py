@@ -112,6 +112,7 @@ def test_a_run_goes_out_in_every_format(empty: ModuleType, small_run: SmallRun, 
     assert file.exists() and "6 f" in said, said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fbx", "glb", "usd", "abc"])
 def test_fingers_and_toes_go_with_the_measured_skin(empty: ModuleType, tmp_path: Path, kind: str) -> None:
     """The sample walks 0.2 m: what does not move with the rest stretches the skin."""
@@ -160,6 +161,7 @@ def test_the_full_models_names(empty: ModuleType, full_run: Path, tmp_path: Path
     assert parents["mixamorig:RightArm"] == "mixamorig:RightShoulder" and parents["mixamorig:RightShoulder"] == "collar.R"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bvh", "glb", "c3d"])
 def test_a_run_of_one_frame_goes_out(empty: ModuleType, full_run: Path, tmp_path: Path, kind: str) -> None:
     assert export_file(full_run, kind, tmp_path / f"a.{kind}", "plain", Monitor()).partition(", ")[0].endswith("1 frames")

@@ -23,6 +23,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return with_small_texture(folder)
 
 
+@pytest.mark.slow
 def test_the_operator_gives_the_commands_numbers_and_a_scene(blender: ModuleType, take: Path, tmp_path: Path) -> None:
     overrides = {"growing": {"spacing_px": 6}}
     pipeline.run(take, tmp_path / "command", overrides)

@@ -206,6 +206,7 @@ def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, sma
     assert save_blend(tmp_path / "body.blend") == "" and len(list(tmp_path.glob("body*.blend"))) == 2
 
 
+@pytest.mark.slow
 def test_edits_in_the_scene_of_a_run_are_kept(blender: ModuleType, empty: ModuleType, small_run: SmallRun) -> None:
     """Keyed, saved in Blender, and built again: by the command, from the open file itself, and with the button."""
     from tricap.addon.scene.build import build_scene
@@ -270,6 +271,7 @@ def test_the_operator_builds_saves_and_keeps_the_open_file(blender: ModuleType, 
     assert "Tricap" in blender.data.collections
 
 
+@pytest.mark.slow
 def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     line = [sys.executable, "-m", "tricap", "scene", str(small_run.out), "--blend", str(tmp_path / "c.blend")]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120)

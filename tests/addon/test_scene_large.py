@@ -1,6 +1,8 @@
 """Long recordings, attributes for geometry nodes, and builds that fail: what was there before stays."""
 
+import errno
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -51,6 +53,22 @@ def test_clouds_without_points_have_colours(empty: ModuleType, small_run: SmallR
         write_cloud(path, **none)
     for colour in ("intensity", "sigma", "speed"):
         assert build_scene(small_run.out, options=SceneOptions(colour=colour)).counts["cloud points"] == 0
+
+
+def test_a_folder_of_clouds_that_may_not_be_read_is_not_called_empty(
+    empty: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    def listed(folder: Path) -> Iterator[Path]:
+        if folder.name == "clouds":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return iterdir(folder)
+
+    iterdir = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", listed)
+    (said,) = [warning for warning in build_scene(small_run.out).warnings if "point cloud" in warning]
+    assert "cannot read" in said and "Permission denied" in said
 
 
 @pytest.mark.parametrize("failure", ["footage", "cancelled", "no OpenVDB"])

@@ -49,6 +49,7 @@ def seen(bpy: ModuleType) -> set[str]:
     return {o.name for o in bpy.context.view_layer.objects if o.type == "META" and o.visible_get()}
 
 
+@pytest.mark.slow
 def test_a_whole_body_plays_fast_until_its_metaballs_are_shown(blender: ModuleType, empty: ModuleType, whole_body: Path) -> None:
     from tricap.addon.scene.build import build_scene
 

@@ -390,6 +390,7 @@ def test_what_the_filters_removed_is_shown_by_reason(empty: ModuleType, small_ru
         read_contents(small_run.out, Monitor(), removed=True)
 
 
+@pytest.mark.slow
 def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> None:
     from tricap.addon.scene import metaballs, skin
 

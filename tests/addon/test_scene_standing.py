@@ -203,6 +203,7 @@ def test_a_part_of_a_body_stands_nowhere(blender: ModuleType, small_run: Any) ->
     assert blender.context.scene.tricap.path == "BONE"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fbx", "glb"])
 def test_posed_fingers_are_exported(empty: ModuleType, out: Path, tmp_path: Path, kind: str) -> None:
     """A finger that the animator bends arrives in other programs' files, with the skin that it deforms."""

@@ -45,6 +45,7 @@ def start(bytecode: Path, *arguments: str) -> tuple[float, set[str]]:
     return float(seconds), set(modules)
 
 
+@pytest.mark.slow
 def test_enabling_loads_no_stage_and_is_quick(tmp_path: Path) -> None:
     _, modules = start(tmp_path)
     assert "tricap.core.run.settings" in modules
@@ -52,5 +53,6 @@ def test_enabling_loads_no_stage_and_is_quick(tmp_path: Path) -> None:
     assert min(start(tmp_path)[0] for _ in range(3)) < LIMIT_S
 
 
+@pytest.mark.slow
 def test_a_loaded_stage_is_found_out(tmp_path: Path) -> None:
     assert {"tricap.core.run.pipeline", "tricap.core.run.record", "tricap.core.tracking.track"} <= start(tmp_path, "work")[1]

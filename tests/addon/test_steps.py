@@ -68,6 +68,7 @@ def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
     return blender.context.scene
 
 
+@pytest.mark.slow
 def test_an_opened_take_shows_its_frames(blender: ModuleType, sample: Path, tmp_path: Path) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = opened(blender, sample, tmp_path)
@@ -148,6 +149,7 @@ def done(blender: ModuleType, words: Words, sample: Path, results: Path, tmp_pat
     return scene
 
 
+@pytest.mark.slow
 def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
     scene = done
     scene.tricap.fitting.gate_m = 0.04
@@ -172,6 +174,7 @@ def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, 
     assert words().split()[3:7] == ["done", "done", "done", "done"]
 
 
+@pytest.mark.slow
 def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
     blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,6 +299,7 @@ def test_a_surface_that_was_left_out_is_no_open_step(blender: ModuleType, done: 
     assert words().split()[3:6] == ["done", "done", "done"] and "Skipped" in why("surface")
 
 
+@pytest.mark.slow
 def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any, tmp_path: Path, words: Words) -> None:
     run = (tmp_path / "out" / "run.json").stat().st_mtime_ns
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "run.json").stat().st_mtime_ns == run
@@ -313,6 +317,7 @@ def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "motion.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_copy_of_large_footage_is_not_read(
     blender: ModuleType, done: Any, words: Words, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -919,6 +924,7 @@ def built(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", ["nothing", "results", "results and take"])
 def test_the_commands_scene_shows_the_finished_project(
     blender: ModuleType, built: Path, tmp_path: Path, words: Words, why: Any, moved: str
@@ -944,6 +950,7 @@ def test_the_commands_scene_shows_the_finished_project(
     assert before == {path: path.stat().st_mtime_ns for path in take.rglob("*")}, "opening a file writes nothing"
 
 
+@pytest.mark.slow
 def test_a_scene_whose_take_is_gone_says_so(blender: ModuleType, built: Path, tmp_path: Path, words: Words, why: Any) -> None:
     lost = (built / "take").rename(built / "renamed")
     try:

@@ -132,6 +132,7 @@ def click_outside(take: Path) -> None:
     replace(take / "take.toml", "frame = 0", "frame = 400")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [

@@ -1,13 +1,17 @@
 """Other tools' calibration files, read and written: Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV, Agisoft."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ...foundation.errors import InputError
+from ...geometry.camera import Camera
 from ...geometry.rig import Rig, check_cameras
 from ...results.listed_files import check_files, list_files
 from . import agisoft, colmap, opencv_files, openptv, toml_files
-from .reading import text_of
+from .reading import grid_of, text_of
 
 FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "agisoft": agisoft.write,
@@ -19,7 +23,18 @@ FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "openptv": openptv.write,
     "pose2sim": toml_files.write_pose2sim,
 }
+READERS: dict[str, Callable[[Path], Rig]] = {
+    "agisoft": agisoft.read,
+    "anipose": toml_files.read,
+    "caliscope": toml_files.read,
+    "colmap": colmap.read,
+    "easymocap": opencv_files.read_easymocap,
+    "opencv": opencv_files.read,
+    "openptv": openptv.read,
+    "pose2sim": toml_files.read,
+}
 WITH_FISHEYE = ("anipose", "pose2sim", "caliscope")  # that can hold OpenCV's fisheye lens
+NOTED_PX = 0.1  # between a camera and what a format makes of it: from here it is told
 FOLDERS = {  # formats of several files in a folder, and their names
     "colmap": ("cameras.txt", "images.txt", "points3D.txt"),
     "easymocap": ("intri.yml", "extri.yml"),
@@ -78,3 +93,26 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     written = FORMATS[name](Path(path), rig)
     list_files(Path(path), FOLDERS[name], [file.name for file in written])
     return written
+
+
+def lens_note(path: Path, rig: Rig, name: str) -> str:
+    """Which camera in a file of `write_as` differs most from the rig's, because the format lacks terms of its lens: a sentence, or ""."""
+    again = READERS[name](Path(path)).cameras
+    named = {camera.name: camera for camera in again}
+    pairs = [(camera, named.get(camera.name, other)) for camera, other in zip(rig.cameras, again)]
+    off_px, worst = max((_apart_px(camera, other), camera.name) for camera, other in pairs)
+    if off_px < NOTED_PX:
+        return ""
+    return (
+        f"Camera {worst} in {path} differs by up to {off_px:.1f} px from the calibrated one, because {name} lacks terms of its lens; "
+        "where that matters, choose another format."
+    )
+
+
+def _apart_px(camera: Camera, other: Camera) -> float:
+    """The largest distance between pixels of a camera and where another one sees the same directions; inf where it sees some nowhere."""
+    xy = grid_of(camera)
+    directions = camera.directions(xy) @ camera.R_cam_world
+    seen = replace(other, t_cam_world_m=np.zeros(3)).project(directions)
+    apart = np.linalg.norm(seen - xy, axis=1)
+    return float(apart.max()) if np.isfinite(apart).all() else np.inf

@@ -113,6 +113,7 @@ def _points(shape: BodyShape, skin: OneSkin, turn: np.ndarray) -> list[SurfacePo
     return [one] * 24
 
 
+@pytest.mark.slow
 def test_a_face_tells_where_the_head_looks(person) -> None:
     shape, skin = person
     turn = np.radians([-24.0, 12.0, 3.0])
@@ -122,6 +123,7 @@ def test_a_face_tells_where_the_head_looks(person) -> None:
     )
 
 
+@pytest.mark.slow
 def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
     shape, skin = person
     assert registered_head(skin, shape, []) is None

@@ -38,6 +38,7 @@ def face_normals(skin: OneSkin) -> np.ndarray:
     return np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "detail"), [("full", 1), ("upper_body", 2), ("leg.L", 1)])
 def test_it_is_closed_and_faces_outwards(model: str, detail: int) -> None:
     skin = skin_of(model, detail)

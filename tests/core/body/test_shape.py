@@ -47,7 +47,6 @@ def test_weights_that_were_fitted_keep_their_sigmas(tmp_path: Path) -> None:
         ("head =", "heed ="),
         ("[[bones]]", "[[bonse]]"),
         ("= [", "= [["),
-        ('bone = "forearm.R"', 'bone = "nose"'),
         ("weight = 1.0", 'weight = "much"'),
         ("length_m = 0", "length_m = -0"),
         ("radii_m = [0", "radii_m = [1e300"),
@@ -59,6 +58,14 @@ def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:
     write_body(path, default_shape(read_model("arm.R")))
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match="run the fit again"):
+        read_body(path)
+
+
+def test_a_metaball_of_no_bone_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "body.toml"
+    write_body(path, default_shape(read_model("arm.R")))
+    path.write_text(path.read_text().replace('bone = "forearm.R"', 'bone = "nose"'))
+    with pytest.raises(InputError, match="the bone “nose”, which does not exist"):
         read_body(path)
 
 

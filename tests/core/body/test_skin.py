@@ -46,6 +46,7 @@ def test_closed_and_outward(limb: BodyShape, bend: float) -> None:
     assert np.allclose(skin.weights.sum(axis=1), 1) and skin.weights.min() >= 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bend", "twist"), [(0.0, 90.0), (90.0, -60.0), (120.0, 0.0), (120.0, 80.0)])
 def test_does_not_cut_itself(bend: float, twist: float) -> None:
     shape = default_shape(read_model("arm.R"))

@@ -84,6 +84,7 @@ def test_every_derivative_of_a_board_agrees_with_differences() -> None:
         assert np.abs((ahead - back) / 2e-6 - B[:, n]).max() < 1e-5 * np.abs(B[:, n]).max(), f"board {n}"
 
 
+@pytest.mark.slow
 def test_random_rigs_reach_the_bound_and_know_it() -> None:
     """Single ratios have measured 0.6 to 1.5 over 10 seeds: one eigen-direction dominates."""
     ratios = []
@@ -123,6 +124,7 @@ def test_squares_and_markers_that_no_print_has(square_m: float, marker_m: float)
         Board(kind=BoardKind.CHARUCO, squares=(7, 5), square_m=square_m, marker_m=marker_m)
 
 
+@pytest.mark.slow
 def test_cameras_that_are_not_in_step_are_calibrated_with_a_waved_board() -> None:
     """Measured over 6 recordings: delays within 0.0003 images, errors 1.0 to 1.6 times the bound of cameras in step."""
     rng, delay = np.random.default_rng(2), (0.0, 0.37, -2.2)
@@ -134,6 +136,7 @@ def test_cameras_that_are_not_in_step_are_calibrated_with_a_waved_board() -> Non
     assert done.verdict.light == "green" and not done.calibration.remarks
 
 
+@pytest.mark.slow
 def test_fisheye_lenses_are_recognised_and_calibrated() -> None:
     """Measured over 4 rigs: 0.6 to 0.9 times the bound of all unknowns, of which some are left out."""
     rng = np.random.default_rng(2)
@@ -159,6 +162,7 @@ def test_images_are_chosen_in_runs_that_show_motion() -> None:
     assert len(apart) == 240 and np.diff(apart).min() > 4 and len(_even(np.arange(9), 0)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("turned", "said"), [(0.01, "camera C, moved, exchanged or not synchronised"), (0.0005, "seems to have been moved")]
 )

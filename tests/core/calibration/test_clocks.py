@@ -63,6 +63,7 @@ def test_points_between_images_are_those_of_the_path() -> None:
         assert np.isfinite(off).mean() > 0.7 * np.isfinite(at_once[c][..., 0]).mean() and np.nanmax(off) < 0.02
 
 
+@pytest.mark.slow
 def test_three_rates_calibrate_as_well_as_one() -> None:
     """The starts of two films are wrong by 3 and 5 ms, which the adjustment finds: right to 0.3 ms."""
     cameras = benchmark_cameras()

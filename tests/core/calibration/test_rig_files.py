@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
+from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, read_any, write_as
 from tricap.core.calibration.rig_files.openptv import image
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.camera import Camera
@@ -66,6 +66,20 @@ def test_cameras_without_shear_are_exact(name: str, tmp_path: Path) -> None:
     write_as(path, rig, name)
     again = read_any(path)
     assert distance(rig, Rig(cameras=tuple(again[c.name] for c in rig.cameras))) < 1e-6
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_a_lens_that_a_format_cannot_hold_is_told(name: str, tmp_path: Path) -> None:
+    """Exported lenses were silently wrong by up to 5.6 px."""
+    strong = tuple(replace(without_shear(c), distortions=np.array([-0.3, 0.3, 0.002, 0.001, -0.4])) for c in benchmark_cameras())
+    for rig, without in ((Rig(cameras=strong), ("openptv", "pose2sim")), (sheared(strong), {*FORMATS} - {"agisoft"})):
+        write_as(target(tmp_path, name), rig, name)
+        note = lens_note(target(tmp_path, name), rig, name)
+        assert (f"{name} lacks terms of its lens" in note) == (name in without) and (name in without or not note)
+
+
+def sheared(cameras: tuple[Camera, ...]) -> Rig:
+    return Rig(cameras=tuple(replace(camera, affinity=np.array([0.0, 0.02])) for camera in cameras))
 
 
 def test_opencv_xml(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ def test_a_simple_lens_gets_the_small_model() -> None:
     assert np.median(ratios) < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [
@@ -230,6 +231,7 @@ def test_fisheye_cameras_that_are_not_in_step_are_calibrated() -> None:
     assert all(c.fisheye for c in done.rig.cameras) and error_m(cameras, done.rig.cameras) < 5e-4
 
 
+@pytest.mark.slow
 def test_wide_cameras_with_brown_lenses_keep_them() -> None:
     wide = [replace(c, matrix=c.matrix * [[0.6, 1, 1], [1, 0.6, 1], [1, 1, 1]]) for c in benchmark_cameras()]
     waved = waved_bar(wide, 200, np.random.default_rng(1), BarNoise(sigma_px=0.05))

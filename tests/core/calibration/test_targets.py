@@ -118,6 +118,7 @@ def test_with_their_diameter_known_small_reflections_are_left_out() -> None:
         measure_bar(None, 0.5, Monitor(), diameter_m=0.6)
 
 
+@pytest.mark.slow
 def test_a_mask_for_each_camera(bar_folder, tmp_path: Path) -> None:
     folder, waved = bar_folder
     masks = tmp_path / "masks"
@@ -167,7 +168,8 @@ def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
     assert error_m(waved.cameras, estimated, waved.ends_m.reshape(-1, 3)) < 0.5e-3
 
 
-@pytest.mark.parametrize(("lines", "first"), [("odd", 0), pytest.param("both", 0, marks=pytest.mark.slow), ("both", 1)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("lines", "first"), [("odd", 0), ("both", 0), ("both", 1)])
 def test_an_interlaced_bar(tmp_path: Path, lines: str, first: int) -> None:
     """The other field holds another instant: only the field's own rows may be used, of both fields each for its own frame.
 
@@ -193,6 +195,7 @@ def test_an_interlaced_bar(tmp_path: Path, lines: str, first: int) -> None:
     assert write_report(tmp_path / "report", done)
 
 
+@pytest.mark.slow
 def test_the_recorded_bar(shared_takes: Path, tmp_path: Path) -> None:
     """The recording beside the repository: from its images alone."""
     from tricap.core.geometry.rig import read_rig

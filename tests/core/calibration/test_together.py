@@ -53,6 +53,7 @@ def bound_m(waved: WavedBar, held: HeldBoard) -> float:
     return predicted_error(waved.cameras, unknowns, covariance, truth.TEST_BARS).rms_m
 
 
+@pytest.mark.slow
 def test_both_reach_the_bound_of_both_and_know_it() -> None:
     """Ratios have measured 0.5 to 1.6 over 30 random rigs, 1.03 by RMS."""
     waved, held = films(3, benchmark_cameras(), benchmark_cameras())
@@ -66,6 +67,7 @@ def test_both_reach_the_bound_of_both_and_know_it() -> None:
     assert done.rig.metadata["bar_length_m"] == 0.5 and done.rig.metadata["board"] == "chessboard"
 
 
+@pytest.mark.slow
 def test_it_is_the_minimum_of_all_image_points() -> None:
     """At the result the gradient of the common sum of squares vanishes: the next step is a small part of a sigma."""
     waved, held = films(4, benchmark_cameras(), benchmark_cameras())
@@ -83,6 +85,7 @@ def test_it_is_the_minimum_of_all_image_points() -> None:
     assert np.abs(step / sigma).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -106,6 +109,7 @@ def test_films_that_contradict_each_other_are_never_good(spoil: str, said: str) 
     assert done.verdict.light != "green" and said in done.verdict.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("turn", "zoom", "message"),
     [
@@ -128,6 +132,7 @@ def test_lengths_that_no_rig_fits_are_refused() -> None:
         calibrated(waved, test_boards.observed(held), length_m=0.525)
 
 
+@pytest.mark.slow
 def test_lenses_alone_are_taken_from_cameras_that_stood_elsewhere() -> None:
     """The board was filmed by one camera after the other, turned by any angle: its images share nothing but the lenses."""
     cameras = benchmark_cameras()

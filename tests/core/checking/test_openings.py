@@ -114,6 +114,7 @@ if os.name != "nt":
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_a_run_refuses_the_check_finds(plane_take: Path, tmp_path: Path, fault: str) -> None:
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))

@@ -85,6 +85,7 @@ def test_a_fault_of_a_rig_is_named(name: str, tmp_path: Path) -> None:
     assert json.dumps(checked.to_table(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_run_warns_of_cameras_at_the_same_position(arm_recording: Callable[..., Path]) -> None:
     """Its warnings had nothing but a wrong unit."""
     footage = open_take(read_take(arm_recording()))
@@ -94,6 +95,7 @@ def test_a_run_warns_of_cameras_at_the_same_position(arm_recording: Callable[...
     assert "same place" in [finding.cause for finding in check_first_frame(replace(footage, rig=rig), 0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1.04, 1.1])
 def test_a_run_warns_of_a_camera_with_another_focal_length(arm_recording: Callable[..., Path], width: float) -> None:
     """Its rays still meet those of one other camera, so that a body was fitted without a word."""

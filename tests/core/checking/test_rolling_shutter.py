@@ -66,6 +66,7 @@ def test_the_readout_is_found_with_its_sigma_beside_an_offset(tmp_path: Path) ->
     assert "shorter" in rolling_finding(found["L"]).sentence
 
 
+@pytest.mark.slow
 def test_a_known_readout_is_taken_out_of_the_images_and_of_the_check(tmp_path: Path) -> None:
     """Measured: 0.17 of the difference between the images remains."""
     take = read_take(rolling_take(tmp_path, {"R": 0.5}, {}))

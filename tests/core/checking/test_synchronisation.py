@@ -61,6 +61,7 @@ def test_a_view_late_by_frames_is_told_to_be_shifted_first(tmp_path: Path) -> No
         synchronised(open_take(read_take(tmp_path / "take")), Monitor())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interlaced", "second"), [("odd", 0), ("even", 1)])
 def test_each_field_is_put_to_its_moment_as_if_it_were_alone(tmp_path: Path, interlaced: str, second: int) -> None:
     """What a late view showed before and after is asked of the same lines of the images before and after."""

@@ -210,6 +210,7 @@ def checked_with(arm_recording: Record, tmp_path_factory: pytest.TempPathFactory
     return lambda fault: check(*pairs.get(fault, (fault,)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda make: make.__name__)
 def test_the_fault_is_named(checked_with: Callable[[Fault], Checked], fault: Fault) -> None:
     checked, cause = checked_with(fault), FAULTS[fault]
@@ -234,7 +235,8 @@ def test_the_development_recordings_pass(take: Path) -> None:
     assert not checked.findings, checked.lines()
 
 
-@pytest.mark.parametrize("late", [0.25, pytest.param(0.5, marks=pytest.mark.slow), pytest.param(-1.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0.25, 0.5, -1.3])
 def test_a_late_view_is_found_to_a_twentieth_of_a_frame(arm_recording: Record, late: float) -> None:
     """Measured: 0.010 frames at worst at 480 and 384 px."""
     told: list[tuple[str, float]] = []
@@ -434,6 +436,7 @@ def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", ["L", "C", "R"])
 def test_a_camera_that_was_moved_along_its_base_is_named(arm_recording: Record, tmp_path: Path, view: str) -> None:
     """Every pair of views agrees with the rig still, and half of the points were lost."""

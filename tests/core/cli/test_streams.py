@@ -49,6 +49,7 @@ def test_every_line_ends_with_the_code_of_what_was_found(rig: Path) -> None:
     assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", ["check RIG", "check RIG --json", "--help", "run --help"])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path, arguments: str, unbuffered: str) -> None:
@@ -59,6 +60,7 @@ def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path, arguments: 
     assert shell("tricap --help | head -c 0; exit ${PIPESTATUS[0]}", rig).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
 def test_every_encoding_takes_every_character(rig: Path, encoding: str) -> None:
     plain = shell("tricap check RIG; tricap check RIG --json", rig, PYTHONIOENCODING=encoding)
@@ -113,6 +115,7 @@ def test_a_limit_of_memory_is_one_sentence(rig: Path) -> None:
     assert shell("ulimit -v 1000000; tricap check RIG", rig).returncode == 1
 
 
+@pytest.mark.slow
 def test_a_name_that_is_too_long_is_one_sentence(rig: Path) -> None:
     long = "a" * 500
     for line in (

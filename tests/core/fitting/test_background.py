@@ -18,6 +18,7 @@ from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 
 
+@pytest.mark.slow
 def test_nothing_of_a_moving_arm_is_empty(tmp_path: Path) -> None:
     make_arm_take(tmp_path, ArmTakeSettings(frames=8, width_px=384, interlaced="none"), Monitor())
     truth, footage = np.load(tmp_path / "truth.npz"), open_take(read_take(tmp_path))

@@ -53,6 +53,7 @@ def test_muscles_are_found(weights: bool) -> None:
     assert np.mean(complete) < 0.8 * np.mean(three)  # 1.74 mm to 1.16, with weights 1.04
 
 
+@pytest.mark.slow
 def test_outlines_show_the_side_that_no_camera_sees() -> None:
     """The complete model on points of the front alone, and on outlines as well: the flesh behind, 3.7 mm RMS and 1.2."""
     behind = {False: list[float](), True: list[float]()}

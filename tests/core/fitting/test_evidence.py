@@ -60,6 +60,7 @@ def _blind(scene) -> list[SimpleNamespace]:
     return [SimpleNamespace(frame=cloud.frame, **none) for cloud in scene.clouds]
 
 
+@pytest.mark.slow
 def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
     scene = make_scene(frames=9)
     last = len(scene.clouds) - 1
@@ -113,6 +114,7 @@ def test_regions_of_many_frames_are_unpacked_within_a_limit(monkeypatch: pytest.
     assert regions.cells(n - 1) is regions.cells(n - 1)
 
 
+@pytest.mark.slow
 def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene, other_person) -> None:
     before, after = [], []
     for seed in range(4):
@@ -203,6 +205,7 @@ def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
     assert before > 3 and after < 1.0  # a centimetre
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("given", "limit_m"), [("outlines", 3e-3), ("background", 5e-3)])
 def test_outlines_and_clicks_alone_are_enough(make_scene, other_person, given: str, limit_m: float) -> None:
     scene = make_scene(frames=8, seed=5, shape=other_person("arm.R", np.random.default_rng(5)))

@@ -95,6 +95,7 @@ def _vector(fit) -> np.ndarray:
     return fit.parameters.vector(SHAPE)
 
 
+@pytest.mark.slow
 def test_the_whole_limbs_are_arms_and_legs(fit) -> None:
     limbs, arm = whole_limbs(fit.parameters), _arm(fit)
     assert {NAMES[limb.bones[0]] for limb in limbs} == {"upper_arm.R", "upper_arm.L", "thigh.R", "thigh.L"}
@@ -104,6 +105,7 @@ def test_the_whole_limbs_are_arms_and_legs(fit) -> None:
     assert dofs == {f"{joint} {name}" for joint, names in moved.items() for name in names}
 
 
+@pytest.mark.slow
 def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     limb, vector = _arm(fit), _vector(fit)
     evidence, state = fit.seen(4, NOTHING), fit.parameters.state(POSES[4], vector)

@@ -121,6 +121,7 @@ def test_a_fit_in_stretches_resumes_with_the_next(given: FitInput, tmp_path: Pat
         assert again.begun == monitor.begun[stopped_at:]
 
 
+@pytest.mark.slow
 def test_marginal_priors_of_earlier_stretches_are_released(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are as large as a stretch's covariances: a long fit would need twice the memory."""
     scene, alive, adjusted = make_scene(frames=21, click=9), list[int](), sequence._stretch

@@ -73,6 +73,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(find, "COMPLETED", 2)
 
 
+@pytest.mark.slow
 def test_a_person_is_found_from_points_alone(quick) -> None:
     pose = _pose(30.0)
     found = find_joints(_input(pose), SETTINGS, Monitor(), RARE)

@@ -26,6 +26,7 @@ def test_weights_are_parameters_only_where_that_is_asked_for() -> None:
     assert np.isclose(balls.weight[-1], 1.3) and np.allclose(with_weights.vector(with_weights.shape(vector, 0 * vector)), vector)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "alternating"])
 def test_a_ball_of_another_weight_is_found(make_scene, method: str) -> None:
     shape = default_shape(read_model("arm.R"))

@@ -24,6 +24,7 @@ def projected(scene: Scene, frame: int, *joints: str) -> dict:
     return {name: {c.name: c.project(scene.joints_m[frame, names.index(name)]) for c in scene.rig.cameras} for name in joints}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shoulder", "elbow"), [(-75, 45), (-110, 60), (60, -60)])
 def test_a_limb_that_went_wrong_is_corrected_by_a_click_after_it_and_before_it(make_scene, shoulder: int, elbow: int) -> None:
     scene = make_scene(frames=9, seed=1)

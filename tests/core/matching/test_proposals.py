@@ -82,6 +82,7 @@ def cloth_points(truth: Truth, count: int) -> np.ndarray:
     return truth.vertices_m[0, np.random.default_rng(3).permutation(rows)[:count]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", [0, 1])
 def test_a_clicked_point_of_the_cloth_is_proposed_where_it_is(arm: tuple[Footage, Truth, list[SplineImage]], view: int) -> None:
     footage, truth, images = arm

@@ -63,6 +63,7 @@ def test_two_seeds_cover_the_surface(scene) -> None:
     assert (np.diff(field.cell) > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blinded", [0, 2])
 def test_search_images_are_independent(scene, monkeypatch: pytest.MonkeyPatch, blinded: int) -> None:
     """A search image without content loses its own matches, and so all points; the other's are the same to the last bit."""

@@ -115,3 +115,18 @@ def test_a_word_for_a_number_is_refused(tmp_path: Path) -> None:
         read_motion(tmp_path / "motion.csv", skeleton)
     with pytest.raises(InputError, match="missing.csv"):
         read_motion(tmp_path / "missing.csv", skeleton)
+
+
+def test_a_negative_sigma_is_refused(tmp_path: Path) -> None:
+    skeleton, motion = read_model("arm.R").skeleton, _motion()
+    write_motion(tmp_path / "motion.csv", motion, skeleton)
+    write_joints(tmp_path / "joints.csv", motion)
+    for name, read in (("motion.csv", lambda path: read_motion(path, skeleton)), ("joints.csv", read_joints)):
+        path = tmp_path / name
+        read(path)
+        *lines, last = path.read_text().splitlines()
+        words = last.split(",")
+        words[-1 if name == "motion.csv" else -2] = "-0.5"
+        path.write_text("\n".join([*lines, ",".join(words)]) + "\n")
+        with pytest.raises(InputError, match="negative sigma .-0.5"):
+            read(path)

@@ -21,6 +21,7 @@ def test_a_sigma_has_two_digits_that_count(value: float, sigma: float, said: tup
     assert quoted(value, sigma) == said
 
 
+@pytest.mark.slow
 def test_every_figure_has_a_unit_and_a_sigma(plane_take: Path, tmp_path: Path) -> None:
     out = tmp_path / "out put"
     pipeline.run(plane_take, out, {"growing": {"spacing_px": 6}, "surface": {"correct_curvature": False}}, frames=(0, 3))

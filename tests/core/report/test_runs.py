@@ -43,6 +43,7 @@ def test_a_run_without_a_body(finished: Path) -> None:
     assert not list(finished.rglob("*.part"))
 
 
+@pytest.mark.slow
 def test_where_nobody_is_seen_the_run_says_so(plane_take: Path, tmp_path: Path) -> None:
     """Without [body], whoever is seen is fitted; a plane is nobody."""
     take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"

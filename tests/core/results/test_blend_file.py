@@ -139,6 +139,7 @@ def out(plane_take: Path, tmp_path: Path) -> Path:
 OTHER = ["--set", "fitting.search_limbs=false"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [OTHER, ["--restart"], [*OTHER, "--json"]])
 def test_a_run_of_other_settings_keeps_the_edited_file(out: Path, plane_take: Path, capfd: Capture, more: list[str]) -> None:
     argv = ["run", str(plane_take), "--out", str(out), "--frames", "0:2", "--set", "growing.spacing_px=16", "--workers", "1"]
@@ -174,6 +175,7 @@ def test_a_run_that_fails_says_so_too(out: Path, plane_take: Path, capfd: Captur
     assert said.startswith("tricap: Nothing was found. ") and said.endswith("is kept as “body (edited 2).blend”.\n"), said
 
 
+@pytest.mark.slow
 def test_a_take_of_a_batch_keeps_the_edited_file(out: Path, plane_take: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its scene is built in a process whose sentences nobody reads."""
     pytest.importorskip("bpy")

@@ -39,6 +39,7 @@ def test_every_folder_of_results_has_a_pattern_of_our_files() -> None:
     assert {name for name in RESULTS if "." not in name} | {"cache"} == {*MADE_IN}
 
 
+@pytest.mark.slow
 def test_a_run_leaves_files_and_folders_of_the_user(plane_take: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     pipeline.run(plane_take, out, GIVEN, frames=(0, 2))
@@ -82,6 +83,7 @@ def test_files_of_the_user_are_not_counted_as_results(tmp_path: Path) -> None:
     assert lost(tmp_path, results.read_run()) == {"fit": ["skin"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", films.FILMS)
 @pytest.mark.parametrize("more", [[], ["--restart"]])
 def test_a_film_of_the_user_is_refused_before_anything_is_removed(

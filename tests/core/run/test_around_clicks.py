@@ -44,6 +44,7 @@ def sample(tmp_path: Path) -> Path:
     return take
 
 
+@pytest.mark.slow
 def test_a_body_that_was_chosen_automatically(sample: Path) -> None:
     out = sample / "results"
     before = read_joints(out / "joints.csv").joints_m
@@ -54,6 +55,7 @@ def test_a_body_that_was_chosen_automatically(sample: Path) -> None:
     assert np.abs(after["wrist.L"] - before["wrist.L"]).max() < 1e-4, "the other arm stays"
 
 
+@pytest.mark.slow
 def test_images_with_other_times_need_no_whole_fit_and_other_images_do(sample: Path) -> None:
     """The first are those of a copied project."""
     out, image = sample / "results", next(iter(sorted((sample / "C").iterdir())))

@@ -128,6 +128,7 @@ def test_a_damaged_outline_is_refused_before_anything_is_removed(drawn: tuple[Pa
 BODY = ("body.toml", "joints.csv", "motion.csv", "skin/0000.ply", "skin/rest.npz", "report/report.html", "body.blend")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--set", "matching.patch_px=15"]])
 def test_a_new_outline_leaves_the_fitted_body_where_it_is(plane_take: Path, tmp_path: Path, more: list[str]) -> None:
     out, given = tmp_path / "out", ["--frames", "0:2", "--quiet", "--set", "growing.spacing_px=16"]

@@ -68,6 +68,7 @@ def said(capfd: Capture) -> str:
     return error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("call", "after"), [("fsync", 1), ("replace", 4), ("fsync", 9), ("replace", 12)])
 def test_the_disk_is_full(
     take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capfd: Capture, call: str, after: int
@@ -100,6 +101,7 @@ def test_the_disk_is_full_from_the_beginning(take: Path, tmp_path: Path, monkeyp
     assert "Cannot write into" in (text := said(capfd)) and "No space left" in text
 
 
+@pytest.mark.slow
 def test_a_folder_that_turns_read_only(
     take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:
@@ -117,6 +119,7 @@ def test_a_folder_that_turns_read_only(
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", ["L/0003.png", "R", "rig.toml", "."])
 def test_the_input_goes_away(
     take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capfd: Capture, gone: str
@@ -134,6 +137,7 @@ def test_the_input_goes_away(
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 def test_the_results_go_away(take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody clears OUT during the run: what is missing in the end is there after the next run."""
     with monkeypatch.context() as patch:
@@ -142,6 +146,7 @@ def test_the_results_go_away(take: Path, tmp_path: Path, whole: dict[str, bytes]
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 def test_the_clock_is_set_back(take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """By ten years in mid-run, with checkpoints from the future, and forward again: no time of day decides anything."""
     real = time.time

@@ -44,6 +44,7 @@ def run_again(take: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
+@pytest.mark.slow
 def test_another_skin_does_not_fit_the_body_anew(take: Path, run_again: Any) -> None:
     out = take.with_name("out")
     kept = {name: (out / name).read_bytes() for name in ("motion.csv", "joints.csv", "body.toml")}
@@ -53,6 +54,7 @@ def test_another_skin_does_not_fit_the_body_anew(take: Path, run_again: Any) -> 
         run_again({"fitting": {"gate_m": 0.04}})
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_of_the_body_is_fitted_anew(take: Path, run_again: Any) -> None:
     path = take.with_name("out") / "cache" / "body" / "fitted.npz"
     whole = path.read_bytes()

@@ -27,6 +27,7 @@ def run(plane_take: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Foo
     return made.footage, out
 
 
+@pytest.mark.slow
 def test_points_lie_where_they_were_matched(run: tuple[Footage, Path]) -> None:
     footage, out = run
     cameras, rows = footage.rig.cameras, footage.take.rows_at(0)

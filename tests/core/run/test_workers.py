@@ -46,6 +46,7 @@ def test_workers_that_cannot_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
         pass
 
 
+@pytest.mark.slow
 def test_workers_give_the_bytes_of_one_process(plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     many = measured(plane_take, tmp_path / "many", TWO)
     monkeypatch.setattr(workers, "FEWEST", 1000)
@@ -80,6 +81,7 @@ workers._finished = pressed
 sys.exit(main(sys.argv[1:]))"""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="a terminal there has no process groups")
 def test_ctrl_c_in_a_terminal_is_one_sentence_with_the_true_count(plane_take: Path, tmp_path: Path) -> None:
     """It goes to the whole group of processes; what the workers have measured by then counts."""
@@ -104,6 +106,7 @@ def test_what_a_worker_refuses_is_said_in_one_sentence(plane_take: Path, tmp_pat
         measured(take, tmp_path / "out", TWO)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first process of every worker dies at its first task; with no second try, that is an error."""
     marker = tmp_path / "died"

@@ -31,6 +31,7 @@ def along_normal(body: Any, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
     return body.distance_m(cloud.xyz_m), np.sqrt(np.einsum("ni,nij,nj->n", normal, cloud.covariance_m2, normal))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interlaced", "noise"), [("none", 0.5), ("none", 2.0), ("none", 4.0), ("odd", 2.0), ("even", 2.0)])
 def test_a_plane(tmp_path: Path, scenes: Any, interlaced: str, noise: float) -> None:
     """Bias, scatter and sigma along the normal, away from the plane's edge. 1 px of disparity is 22 mm here: measured bias −0.07 mm at

@@ -64,6 +64,7 @@ def test_every_frame_has_a_surface_of_its_own(tmp_path: Path, scenes: Any) -> No
         assert len(m.cloud.xyz_m) > 100 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed_frame", [0, 2])
 def test_a_resumed_run_is_the_same_run(
     plane_take: Path, tmp_path: Path, scenes: Any, seed_frame: int, monkeypatch: pytest.MonkeyPatch
@@ -90,6 +91,7 @@ def test_a_resumed_run_is_the_same_run(
         same(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["image", "rig", "setting", "click"])
 def test_what_changes_is_measured_again(plane_take: Path, tmp_path: Path, scenes: Any, what: str) -> None:
     """A checkpoint is used only where everything it depends on is as it was: the frame itself, and the frames before it."""
@@ -153,6 +155,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
     assert len(distance) > 200 and np.mean(np.abs(distance) < 0.02) > 0.9
 
 
+@pytest.mark.slow
 def test_a_checkpoint_belongs_to_the_frame_that_showed_the_room(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames 0:2 first and then all of them, into one folder, must give what all of them give at once. The background planes differ
     with the frame that frame 0 is compared with; here the number of seeds that stand still is written into a plane far away."""
@@ -288,6 +291,7 @@ def test_the_person_is_followed_by_seeds_of_any_spacing(plane_take: Path, tmp_pa
     assert len(start.person_m) >= max(4, len(start.seeds.depth_m) // 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise, smoothed", [(1.0, False), (20.0, True)])
 def test_noise_that_hides_the_texture_is_smoothed(
     tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, noise: float, smoothed: bool

@@ -53,6 +53,7 @@ def painted(take: Path, folder: Path, view: str, part: slice = slice(None)) -> P
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["object", "epipolar", "published"])
 def test_a_flat_view_of_four_costs_only_its_rays(four_views: Path, tmp_path: Path, scenes: Any, plane: Any, how: str) -> None:
     settings = {
@@ -125,6 +126,7 @@ def fan(scenes: Any, count: int) -> Rig:
     return Rig(cameras=tuple(cameras))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 8])
 def test_from_two_to_eight_cameras(tmp_path: Path, scenes: Any, plane: Any, count: int) -> None:
     """Measured, tracked and reported; eight views see more precisely than two."""

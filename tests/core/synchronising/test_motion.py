@@ -62,12 +62,14 @@ def early(at_thirty: Callable[[Mapping[str, Sequence[int]]], Path]) -> Path:
     return at_thirty({"L": [0] * 12 + moving, "C": [0] * 12 + moving, "R": [0] * 150 + moving})
 
 
+@pytest.mark.slow
 def test_a_view_that_began_much_earlier_is_found_without_sound(early: Path) -> None:
     timings = synchronise(read_take(early), Monitor())
     assert timings[2].method == "motion and rays" and all(t.found for t in timings) and abs(timings[0].start_s) < 3e-3
     assert abs(timings[2].start_s + 138 / 30) < 3e-3 and timings[2].sigma_s < 3e-3
 
 
+@pytest.mark.slow
 def test_another_motion_is_not_taken_for_the_same(early: Path) -> None:
     for path in sorted((early / "R").iterdir()):  # its images are turned about: no point of it is where the rays meet
         picture = cv2.imread(str(path))[::-1, ::-1]

@@ -111,6 +111,7 @@ def loose(at_thirty: Callable[[Mapping[str, Sequence[int]]], Path]) -> Path:
     return at_thirty({"L": range(0, 18, 2), "C": range(0, 18, 2), "R": range(1, 18, 2)})
 
 
+@pytest.mark.slow
 def test_sound_then_rays_give_the_start_of_a_view_half_a_frame_late(loose: Path, capsys: Capture) -> None:
     """The sound is 2 ms early in R, as from a source nearer to it; the rays correct it, to 0.9 ms in images of 224 pixels."""
     room = world(16.0)

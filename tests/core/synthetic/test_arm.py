@@ -94,6 +94,7 @@ def test_second_field_is_half_a_frame_later(tmp_path: Path) -> None:
         assert np.array_equal(picture(slow, view, 0)[0::2], second[0::2]) and not np.array_equal(woven[0::2], first[0::2])
 
 
+@pytest.mark.slow
 def test_the_same_settings_give_the_same_recording_and_replace_it(tmp_path: Path) -> None:
     folder, small = tmp_path / "x", ArmTakeSettings(frames=2, width_px=96)
     make_arm_take(folder, ArmTakeSettings(frames=3, width_px=96, seed=5))

@@ -44,6 +44,7 @@ def put_cloud(out: Path, truth: Truth, frame: int, off_mm: float, wild: int = 0,
     write_cloud(out / "clouds" / f"{frame:04d}.ply", xyz_m=points, sigma_m=np.ones(n), normals=np.zeros((n, 3)), intensity=np.zeros(n))
 
 
+@pytest.mark.slow
 def test_clouds(take: Path, truth: Truth, tmp_path: Path) -> None:
     for frame in range(FRAMES):
         put_cloud(tmp_path, truth, frame, 2.0)

@@ -40,6 +40,7 @@ def test_time_stamps_of_one_or_several_views_are_read_in_the_order_of_the_images
     assert read_timestamps(path, "L").tolist() == [1.0, 2.5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -79,6 +79,7 @@ def beside(m: Any, body: Any) -> float:
     return float(np.mean(np.abs(body.distance_m(m.cloud.xyz_m)) > 0.04))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("said", "told"),
     [

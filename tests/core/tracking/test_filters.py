@@ -65,6 +65,7 @@ def planted(kind: str, true: np.ndarray, random: np.random.Generator) -> tuple[n
     return x, which, false
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["slide", "jump", "swap"])
 def test_planted_false_trajectories_are_caught(kind: str) -> None:
     """Precision and recall of trajectories ≥ 0.95, over three sets of 24 false ones among 240."""

@@ -68,6 +68,7 @@ def test_a_steep_surface(scenes: Any) -> None:
     assert (points.status[0] == TrackStatus.MEASURED).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [(3,), (3, 4, 5)])
 def test_black_frames_are_bridged(scenes: Any, missing: tuple[int, ...]) -> None:
     """The reference view is black: the points report it and resume after it; without bridging and waiting they end."""

@@ -35,6 +35,7 @@ def test_a_turning_plane_is_tracked(plane_take: Path, tmp_path: Path, scenes: An
     assert np.median(away) < 0.15 and away.max() < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("acceleration", "found"), [(30.0, True), (5.0, False)])
 def test_the_second_box_is_the_last(tmp_path: Path, scenes: Any, acceleration: float, found: bool) -> None:
     """A jump of 22 px: 30 m/s² make boxes of 15 px and twice that, 5 m/s² of 4 and 8 px."""

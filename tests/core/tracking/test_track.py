@@ -39,6 +39,7 @@ def whole(plane_take: Path, surfaces: Path, tmp_path_factory: pytest.TempPathFac
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop_at", [1, 2, 3])
 def test_a_resumed_run_is_the_same_run(plane_take: Path, surfaces: Path, whole: Path, tmp_path: Path, scenes: Any, stop_at: int) -> None:
     """Cancelled before frame `stop_at` and run again, with surfaces that come from checkpoints too: byte-equal."""
@@ -64,6 +65,7 @@ def test_a_resumed_run_is_the_same_run(plane_take: Path, surfaces: Path, whole: 
         same(a, b)
 
 
+@pytest.mark.slow
 def test_what_changes_is_tracked_again(plane_take: Path, whole: Path, tmp_path: Path, scenes: Any) -> None:
     shutil.copytree(whole, tmp_path / "out")
     measured = scenes.measure(plane_take, tmp_path / "out")
@@ -97,6 +99,7 @@ def test_filters_need_no_new_tracking(plane_take: Path, whole: Path, tmp_path: P
             scenes.track(plane_take, tmp_path / "out", measured, {"tracking": {name: value}})
 
 
+@pytest.mark.slow
 def test_frames_without_a_surface(tmp_path: Path, scenes: Any) -> None:
     """Every point ends when the picture goes blank; new ones with new identities start when it comes back."""
     plane = scenes.Body(half_m=(0.2, 0.15))

@@ -35,6 +35,7 @@ def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np
     return np.stack([tracks.xyz_m[t] - (own @ bodies[t].R.T + bodies[t].t) for t in range(T)]), on_it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interlaced", "noise"), [("none", 1.0), ("odd", 1.0)])
 def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced: str, noise: float) -> None:
     """No point is lost in the middle, none is false, and the drift is less than 0.3 px across the line of sight."""
@@ -57,6 +58,7 @@ def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced:
     assert seen.sum(axis=0).max() == FRAMES
 
 
+@pytest.mark.slow
 def test_shading_that_stays_in_place_does_not_hold_a_point_back(tmp_path: Path, scenes: Any) -> None:
     """Weak texture that moves under light and shade: the points go with the texture."""
     bodies, rig = moving_plane(scenes, FRAMES), scenes.three_cameras()
@@ -73,6 +75,7 @@ def test_shading_that_stays_in_place_does_not_hold_a_point_back(tmp_path: Path, 
     assert np.isfinite(drift_px[-1]).sum() > 30 and np.nanmedian(drift_px[-1]) < 0.2
 
 
+@pytest.mark.slow
 def test_points_are_followed_in_the_images_in_which_they_were_measured(tmp_path: Path, scenes: Any) -> None:
     """Where noise hides the texture, surface and tracks are both measured in smoothed images."""
     bodies, rig = moving_plane(scenes, 3), scenes.three_cameras()
@@ -106,6 +109,7 @@ def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: A
     assert np.array_equal(tracks.time_s, np.arange(4) / 50.0)
 
 
+@pytest.mark.slow
 def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
     """The mean over all points of velocity against the true one; its scatter is that of the positions."""
     bodies = moving_plane(scenes, 5)
@@ -122,6 +126,7 @@ def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
     assert np.isnan(tracks.acceleration_m_s2[[0, -1]]).all() and np.isfinite(tracks.velocity_m_s[[0, -1]][:, whole]).all()
 
 
+@pytest.mark.slow
 def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any) -> None:
     """A plane comes into the picture: later frames have as many points per area as the first, no closer, and new ones in every second
     frame only."""
@@ -163,6 +168,7 @@ def test_an_occluded_point_ends_with_a_reason(tmp_path: Path, scenes: Any) -> No
     assert moved.max() < 0.3 * scenes.pixel_m
 
 
+@pytest.mark.slow
 def test_lost_points_resume_under_their_identity(tmp_path: Path, scenes: Any) -> None:
     """A bar occludes part of a travelling plane in one frame: its points resume in their places, but not without waiting."""
     bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(4)]
