@@ -14,12 +14,12 @@ from ...core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, app
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig, controls_of
+from ...core.motion.retarget.transfer import GROUND_AT_ORIGIN, lowest_m, stood_up
 from . import saved_maps
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, store_residual_motion, write_action
 
-FLOOR_AT_ORIGIN = 0.1  # fraction of a rig's height: if its feet are nearer to its origin, the floor is at the origin, else under its feet
 CHECKED_FRAMES = 9  # of the action, spread evenly
 TOLERANCE_DEG = 0.5  # between the pose that was keyed and the one that Blender plays
 
@@ -30,7 +30,7 @@ class Target:
 
     rig: Rig
     rig_map: RigMap
-    floor_m: float
+    floor_m: float  # height of the floor under the rig as it stands
 
     @property
     def mapped(self) -> MappedRig:
@@ -78,9 +78,15 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
     if rig_map.control_rig is not None:
         rig = controls_of(rig, rig_map.control_rig, rig_map.bones)
     rig = with_soles(rig, armature_object, rig_map)
-    low = min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
-    origin = float(armature_object.matrix_world.translation.z)
-    return Target(rig=rig, rig_map=rig_map, floor_m=origin if abs(low - origin) < FLOOR_AT_ORIGIN * rig.height_m else low)
+    return Target(rig=rig, rig_map=rig_map, floor_m=_floor_m(rig, rig_map, float(armature_object.matrix_world.translation.z)))
+
+
+def _floor_m(rig: Rig, rig_map: RigMap, origin_m: float) -> float:
+    """The height of the floor under a rig as it stands, whose origin is at this height."""
+    if stood_up(rig, rig_map) is not rig:
+        return 0.0
+    low = lowest_m(rig)
+    return origin_m if abs(low - origin_m) < GROUND_AT_ORIGIN * rig.height_m else low
 
 
 def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:

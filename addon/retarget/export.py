@@ -33,7 +33,7 @@ MODEL_ENDING = ".osim"  # of the model that a .mot file moves, next to it
 POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # usual axes and unit of the format
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
 ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "mot", "fbx", "abc", *POINTS)} | {
-    "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
+    "glb": (".glb",), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
 
 OTHERS = (*IMAGE_ENDINGS, *MOVIE_ENDINGS, ".toml", ".json", ".npz", ".blend")  # of what is no motion: probably a slip
 
@@ -183,8 +183,8 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program, mov
 def _copy_ply(out: Path, folder: Path, of: str, monitor: Monitor) -> str:
     """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
     first, end = (read_run(out / "run.json") if (out / "run.json").is_file() else {}).get("frames", (0, np.inf))
-    files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := list(files_of(out / name, name)))), None)
-    files = files and [file for file in files if not file.stem.isdecimal() or first <= int(file.stem) < end]  # not a copy of the user's own
+    found = ([file for file in files_of(out / name, name) if file.suffix == ".ply"] for name in ([of] if of else ["skin", "clouds"]))
+    files = [file for file in next(filter(None, found), []) if first <= int(file.stem) < end]  # not a copy of the user's own
     if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     for n, file in enumerate(files):

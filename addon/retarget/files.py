@@ -1,5 +1,6 @@
 """Rigs and motions from files: .blend, glTF, VRM and FBX through Blender's importers, the rest through core's readers."""
 
+import builtins
 import re
 import shutil
 import tempfile
@@ -186,6 +187,8 @@ def _reason(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line) and not line.endswith(":")]
     if not reasons and "Traceback" in str(error):
+        return "its importer fails"
+    if reasons and hasattr(builtins, name := reasons[-1].partition(":")[0]) and name != "RuntimeError":  # a bug of the importer's
         return "its importer fails"
     return (reasons or lines or [type(error).__name__])[-1][:200]
 

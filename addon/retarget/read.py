@@ -18,6 +18,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
+from ...core.motion.retarget.transfer import standing_turn
 from ..scene import layers, stored
 from ..scene.armature import ROLES_KEY
 from ..scene.standing import curves_of
@@ -179,7 +180,8 @@ def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> 
         place = _moved(world_matrix(skin), place.reshape(-1, 3))
         for name, vertices in _by_dominant_group(skin, groups).items():
             points.setdefault(name, []).append(place[vertices])
-    soles = {name: sole_points(np.concatenate(parts)) for name, parts in points.items()}
+    turn = standing_turn(rig, rig_map)
+    soles = {name: sole_points(np.concatenate(parts) @ turn.T) @ turn for name, parts in points.items()}
     return Rig(**{f: getattr(rig, f) for f in rig.__dataclass_fields__ if f != "sole_m"}, sole_m=soles)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.arrays import frozen
-from ..foundation.errors import InputError, shown
+from ..foundation.errors import InputError, damage_of, shown
 from ..foundation.settings import nearest_name
 from .metaballs import STATIONS
 from .skeleton import Bone, Dof, Skeleton
@@ -290,7 +290,7 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
     except InputError as error:
         raise InputError(f"The body model {path}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"The body model {path} lacks an entry or has a wrong value: {error}.") from error
+        raise InputError(f"The body model {path} lacks an entry or has a wrong value: {damage_of(error)}.") from error
 
 
 def _check_numbers(

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..foundation import bounded, store
 from ..foundation.arrays import frozen
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, damage_of
 from .anatomy import ball_names
 from .metaballs import ACROSS, THRESHOLD, VISIBLE, Metaballs, field, field_and_derivatives, three_balls
 from .model_file import MOST_LENGTHS, BodyModel, base_dofs, dof_from_table
@@ -256,7 +256,7 @@ def body_of(text: str, path: str = "of a checkpoint") -> BodyShape:
     try:
         return _shape(table)
     except (InputError, KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise InputError(f"The body {path} lacks an entry or has a wrong value ({error}); run the fit again.") from error
+        raise InputError(f"The body {path} lacks an entry or has a wrong value ({damage_of(error)}); run the fit again.") from error
 
 
 def _shape(table: dict[str, Any]) -> BodyShape:

@@ -13,7 +13,7 @@ from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import Start, Starts, calibrate_rig, check_report, measure_bar, open_bar, open_boards, write_report
-from ..calibration.rig_files import FOLDERS, lens_note, read_any, write_as
+from ..calibration.rig_files import FOLDERS, lens_note, notes_of, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 def _board(args: argparse.Namespace) -> Board | None:
     """The board that was described, or None for a bar."""
     if args.board is None:
-        if args.squares or args.square or args.marker or args.printed:
+        if args.squares or args.square or args.marker is not None or args.printed:
             raise InputError("--squares, --square, --marker and --print describe a board; give --board chessboard or --board charuco, too.")
         refuse_unused({"--dictionary": args.dictionary != DICTIONARY}, "describes the markers of --board charuco, which was not given")
         if args.with_board is not None:
@@ -70,16 +70,26 @@ def _described(args: argparse.Namespace) -> Board:
             raise InputError(f"{flag} belongs to a bar, and --board was given; leave one of them out.")
     if args.interlaced != "none" and args.with_board is None:
         raise InputError("Boards are measured in whole images; leave out --interlaced, or calibrate interlaced cameras with a bar.")
+    if args.board != BoardKind.CHARUCO:
+        markers = {"--marker": args.marker is not None, "--dictionary": args.dictionary != DICTIONARY}
+        refuse_unused(markers, "describes the markers of --board charuco, and a chessboard has none")
+    if args.marker == 0:
+        raise InputError("--marker 0 is no side of a marker; give it in metres, or leave it out for three quarters of a square.")
     numbers = re.fullmatch(r"(\d{1,3})[x×](\d{1,3})", args.squares or "")
     if numbers is None or args.square is None:
         raise InputError("Describe the board with --squares, such as 9x6, and --square, the side of a square in metres, such as 0.03.")
     across, down = (int(n) for n in numbers.groups())
-    return Board(kind=BoardKind(args.board), squares=(across, down), square_m=args.square, dictionary=args.dictionary, marker_m=args.marker)
+    return Board(
+        kind=BoardKind(args.board), squares=(across, down), square_m=args.square, dictionary=args.dictionary, marker_m=args.marker or 0.0
+    )
 
 
 def _print(args: argparse.Namespace, board: Board | None) -> list[str]:
     if board is None or args.bar is not None or args.source is not None:
         raise InputError("--print writes a board only; calibrate in a second call, when it is printed.")
+    refuse_unused(
+        {"--out": args.out is not None, "--report": args.report is not None}, "belongs to a calibration, and --print writes a board"
+    )
     write_board(args.printed, board)
     return [
         f"{args.printed}: a {board.kind.value} of {board.label}. "
@@ -119,6 +129,7 @@ def _convert(args: argparse.Namespace) -> list[str]:
     lines = [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
     if "scale" in rig.metadata:
         lines.append(f"The scale of {args.source}: {rig.metadata['scale']}.")
+    lines += notes_of(rig)
     return [*lines, *_lens_notes(args, rig)]
 
 

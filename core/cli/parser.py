@@ -173,7 +173,7 @@ def _calibrate(commands: Any) -> None:
     parser.add_argument("--squares", metavar="9x6", help="across and down: inner corners of a chessboard, squares of a ChArUco board")
     parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
     parser.add_argument("--dictionary", default=DICTIONARY, metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
-    parser.add_argument("--marker", type=float, default=0.0, metavar="M", help="side of a marker in metres; three quarters of a square")
+    parser.add_argument("--marker", type=float, metavar="M", help="side of a marker in metres; three quarters of a square")
     about = "the model of the lenses; auto: the one that fits the images, with a board that of each camera"
     parser.add_argument("--lens", choices=LENSES, default="auto", help=about)
     parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")

@@ -29,6 +29,19 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} …"
 
 
+def damage_of(error: Exception) -> str:
+    """What is wrong with a file that a reader could not read: the words of the reader or of the system, not those of Python."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, UnicodeDecodeError):
+        return "it is not text in UTF-8"
+    if isinstance(error, KeyError):
+        return f"“{error.args[0]}” is missing"
+    if isinstance(error, IndexError):
+        return "it ends too early"
+    return str(error) if isinstance(error, (InputError, ValueError)) else "an entry is missing or of a wrong kind"
+
+
 def with_notes(error: BaseException) -> str:
     """The message of an error, and what was added to it on its way (`add_note`): what the user must also know."""
     return " ".join([str(error), *getattr(error, "__notes__", ())])

@@ -20,10 +20,11 @@ from ..body.motion import GUESSED, KNOWN, BodyMotion
 from ..body.skeleton import Skeleton
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse, frozen
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, damage_of
 from .plausible import LARGEST_FRAME, check_times
 
-JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
+SIGMA = "sigma"
+JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", SIGMA)
 LATER_COLUMNS = ("sigma_frame", "known")
 
 
@@ -106,14 +107,14 @@ def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
     )
 
 
-def read_joints(path: Path) -> JointTable:
-    """Read joints.csv.
+def read_joints(path: Path, needs_sigma: bool = True) -> JointTable:
+    """Read joints.csv, or a table like it, which may lack the sigmas.
 
     Raises:
         InputError: the file is missing, lacks a column, or holds something that is no number.
     """
     header, rows = _read(path)
-    columns = {name: _column(header, name, path) for name in JOINT_COLUMNS}
+    columns = {name: _column(header, name, path) for name in JOINT_COLUMNS if name != SIGMA or needs_sigma}
     frame_sigma, word = (header.index(name) if name in header else None for name in LATER_COLUMNS)
     times: dict[int, float] = {}
     found: dict[str, dict[int, list[float]]] = {}
@@ -124,7 +125,8 @@ def read_joints(path: Path) -> JointTable:
         joint, own = row[columns["joint"]], np.nan if frame_sigma is None else _number(row[frame_sigma], path, line)
         if frame in found.get(joint, {}):
             raise InputError(f"Row {line} of {path} is the second for “{joint[:40]}” in frame {frame}; remove one of them.")
-        found.setdefault(joint, {})[frame] = [*(_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")), own]
+        numbers = [_number(row[columns[c]], path, line) if c in columns else np.nan for c in ("x", "y", "z", SIGMA)]
+        found.setdefault(joint, {})[frame] = [*numbers, own]
         words.setdefault(joint, {})[frame] = "" if word is None else _word(row[word], path, line)
     frames = sorted(times)
     check_sparse(len(rows), len(frames), len(found), path)
@@ -179,7 +181,7 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     except PermissionError as error:
         raise InputError(f"Cannot read the table {path}: {error.strerror}; change its rights.") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read the table {path}: {getattr(error, 'strerror', None) or error}; run the fit again.") from error
+        raise InputError(f"Cannot read the table {path}: {damage_of(error)}; run the fit again.") from error
     if not lines:
         raise InputError(f"The table {path} is empty; run the fit again.")
     header, rows = lines[0], [row for row in lines[1:] if row]

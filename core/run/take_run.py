@@ -177,6 +177,8 @@ def open_run(
     begun, opened = dict(settings), stage_keys(footage, settings, Path(out))["measure"]
     with Results(out).opened() as results:
         before, digests = {} if restart else results.read_run(), FileDigests()
+        if for_contours:
+            _check_frames(results.folder, before, footage.frames)
 
         def by_content() -> dict[str, str]:
             return stage_keys(footage, settings, Path(out), digests.stamp) if reads_content(footage) else {}
@@ -196,6 +198,20 @@ def open_run(
             if not set(STAGES) <= set(record["stages"]):  # before the footage is measured: it may be replaced meanwhile
                 run.content_keys = by_content()
             yield run
+
+
+def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> None:
+    """Check that results in a folder are of these frames: contours of others would take surface and tracks away from a fit.
+
+    Raises:
+        InputError: they are of others.
+    """
+    first, end = before.get("frames", (frames.start, frames.stop))
+    if before.get("stages") and (first, end) != (frames.start, frames.stop):
+        raise InputError(
+            f"{folder} has results of the frames {first}:{end}, and an outline is tracked in the same ones; give --frames {first}:{end}, "
+            "or another folder with --out."
+        )
 
 
 def _kept_stages(

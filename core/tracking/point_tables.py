@@ -11,7 +11,7 @@ import numpy as np
 
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, damage_of
 from ..foundation.settings import nearest_name
 from ..geometry.camera import Camera
 from ..images.interlace import frame_time_s
@@ -49,7 +49,7 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
     except OSError as error:
         raise InputError(f"Cannot read the points {path}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is not a CSV table ({error}); save it as CSV in UTF-8.") from error
+        raise InputError(f"{path} is not a CSV table ({damage_of(error)}); save it as CSV in UTF-8.") from error
     if not rows:
         raise InputError(f"{path} has no points; write a line {','.join(needed)} and one line for each point.")
     if len(rows) > MOST_POINTS:
@@ -121,7 +121,7 @@ def read_planar(path: Path) -> PlanarTable:
     except OSError as error:
         raise InputError(f"Cannot read the tracks {path}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is not a table of 2-D tracks ({error}); choose a file written by `tricap track2d`.") from error
+        raise InputError(f"{path} is not a table of 2-D tracks ({damage_of(error)}); choose a file written by `tricap track2d`.") from error
     if not places:
         raise InputError(f"{path} has no tracks; choose a file written by `tricap track2d`.")
     frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))
@@ -175,7 +175,9 @@ def read_key_points(space: Path, images: Path) -> KeyPointTable:
     except OSError as error:
         raise InputError(f"Cannot read the points {error.filename}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{space} and {images.name} are not tables of followed points ({error}); follow the points again.") from error
+        raise InputError(
+            f"{space} and {images.name} are not tables of followed points ({damage_of(error)}); follow the points again."
+        ) from error
     if not places:
         raise InputError(f"{space} has no points; follow the points again.")
     frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tricap.addon.command import main
-from tricap.addon.retarget.export import export_file
+from tricap.addon.retarget.export import export_file, named_for
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import matrix_from_euler, shortest
@@ -134,6 +134,8 @@ def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
     out = tmp_path / "out"
     for folder in ("skin", "clouds", "tracked"):
         write_mesh(out / folder / "0003.ply", np.full((3, 3), len(folder)), np.array([[0, 1, 2]]))
+    for name in ("rest.npz", "texture.png"):  # what a run has beside the skins
+        (out / "skin" / name).write_bytes(b"no PLY")
     for of, found in (("", "skin"), ("clouds", "clouds"), ("tracked", "tracked")):
         assert export_file(out, "ply", tmp_path / f"of {of}", "plain", Monitor(), of=of) == f"1 files from {found}/"
         assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == (out / found / "0003.ply").read_bytes()
@@ -174,6 +176,8 @@ def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_ru
         export_file(tmp_path, "ply", tmp_path / "ply", "plain", Monitor())
     with pytest.raises(InputError, match="Cannot write"):
         export_file(small_run.out, "glb", wave_file / "a.glb", "plain", Monitor())
+    with pytest.raises(InputError, match="a.gltf does not end in .glb"):  # Blender wrote a.gltf.glb beside it
+        named_for("glb", tmp_path / "a.gltf", None)
     assert not list(tmp_path.glob(".*part*"))
 
 

@@ -137,7 +137,7 @@ class Board:
         """The board as it is printed, with a white margin of one square (h, w) uint8.
 
         Raises:
-            InputError: the picture would be too large.
+            InputError: the picture would be too large, or its squares or markers too small.
         """
         side = round(self.square_m / 0.0254 * dpi)
         columns, rows = (n + (self.kind is BoardKind.CHESSBOARD) for n in self.squares)
@@ -147,6 +147,9 @@ class Board:
                 f"A board of {self.label} with squares of {self.square_m:g} m cannot be drawn as a picture of {size[0]}×{size[1]} pixels."
             )
         if self.kind is BoardKind.CHARUCO:
+            least = self.markers.markerSize + 2  # pixels, one for each cell and the border
+            if (self.marker_m or MARKER_PART * self.square_m) * side < least * self.square_m:
+                raise InputError(f"Markers of {self.marker_m:g} m are too small to be drawn at {dpi:g} dpi; give a larger --marker.")
             return np.asarray(self.charuco().generateImage(size, marginSize=side, borderBits=1))
         dark = np.indices((rows, columns)).sum(axis=0) % 2 == 0
         squares = np.where(dark, 0, 255).astype(np.uint8)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, check_cameras
@@ -34,6 +35,13 @@ READERS: dict[str, Callable[[Path], Rig]] = {
     "pose2sim": toml_files.read,
 }
 WITH_FISHEYE = ("anipose", "pose2sim", "caliscope")  # that can hold OpenCV's fisheye lens
+ENDINGS = {  # of the formats of one file, by which it is read again
+    "agisoft": (".xml",),
+    "anipose": (".toml",),
+    "caliscope": (".toml",),
+    "opencv": (".yml", ".yaml", ".xml"),
+    "pose2sim": (".toml",),
+}
 NOTED_PX = 0.1  # between a camera and what a format makes of it: from here it is told
 FOLDERS = {  # formats of several files in a folder, and their names
     "colmap": ("cameras.txt", "images.txt", "points3D.txt"),
@@ -77,10 +85,13 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     """Write a rig in another tool's format; the files that were written.
 
     Raises:
-        InputError: the format is unknown, or cannot hold this rig; or files in the folder are not of an earlier call.
+        InputError: the format is unknown, cannot hold this rig, or has files of another ending; or files in the folder are not of an
+            earlier call.
     """
     if name not in FORMATS:
         raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
+    if name not in FOLDERS and Path(path).suffix.lower() not in ENDINGS[name]:
+        raise InputError(f"{Path(path).name} is no name of a file of {name}; let it end in {' or '.join(ENDINGS[name])}.")
     if name in FOLDERS and Path(path).is_file():
         raise InputError(f"{path} is a file; {name} needs a folder.")
     check_cameras(rig.cameras, "The rig")
@@ -93,6 +104,12 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     written = FORMATS[name](Path(path), rig)
     list_files(Path(path), FOLDERS[name], [file.name for file in written])
     return written
+
+
+def notes_of(rig: Rig) -> list[str]:
+    """What a reader decided about a rig, in sentences: cameras that it left out, sizes that the file lacks."""
+    notes = rig.metadata.get("notes", [])
+    return [note for note in notes if isinstance(note, str) and bounded.is_plain(note)] if isinstance(notes, list) else []
 
 
 def lens_note(path: Path, rig: Rig, name: str) -> str:

@@ -16,7 +16,7 @@ from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera, camera_of, interior_of
 from ...geometry.rig import Rig
-from .reading import NO_UNIT, make_camera, numbers, text_of
+from .reading import NO_UNIT, make_camera, noted, numbers, text_of
 
 
 def read(path: Path) -> Rig:
@@ -32,10 +32,11 @@ def read(path: Path) -> Rig:
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
     scaled = root.findtext(".//chunk/transform/scale")
     scale = float(numbers((scaled or "1").split(), (1,), f"The chunk's scale in {path}")[0])
-    cameras = []
+    cameras, left_out = [], list[str]()
     for element in root.iter("camera"):
         transform = element.findtext("transform")
         if transform is None:
+            left_out.append(str(element.get("label") or element.get("id")))
             continue
         sensor = sensors.get(element.get("sensor_id"))
         if sensor is None:
@@ -43,7 +44,8 @@ def read(path: Path) -> Rig:
         cameras.append(_camera(path, str(element.get("label") or element.get("id")), sensor, transform, scale))
     if not cameras:
         raise InputError(f"{path} has no aligned camera; align the cameras in Metashape and export them as Agisoft XML.")
-    return Rig(cameras=tuple(cameras), metadata={} if scaled else {"scale": NO_UNIT})
+    notes = noted(left_out, "they are not aligned in Metashape")
+    return Rig(cameras=tuple(cameras), metadata=notes if scaled else {"scale": NO_UNIT, **notes})
 
 
 def _camera(path: Path, name: str, sensor: Xml.Element, transform: str, scale: float) -> Camera:
@@ -57,10 +59,10 @@ def _camera(path: Path, name: str, sensor: Xml.Element, transform: str, scale: f
         raise InputError(f"The sensor of camera “{name}” in {path} has no resolution.")
     what = f"Camera “{name}” in {path}"
     w, h = numbers([resolution.get("width"), resolution.get("height")], (2,), what)
-    keys = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
+    keys = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
     p = dict(zip(keys, numbers([calibration.findtext(k) or "0" for k in keys], (len(keys),), what)))
-    if p["k4"]:
-        raise InputError(f"{what} uses k4; optimize the cameras in Metashape without it.")
+    if used := [key for key in ("k4", "p3", "p4") if p[key]]:
+        raise InputError(f"{what} uses {used[0]}; optimize the cameras in Metashape without it.")
     if p["f"] <= 0:
         raise InputError(f"{what} has no focal length.")
     interior = np.array([p["f"], p["cx"] + w / 2 - 0.5, p["cy"] + h / 2 - 0.5, *(p[k] for k in ("k1", "k2", "k3", "p2", "p1"))])

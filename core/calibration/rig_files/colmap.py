@@ -10,7 +10,7 @@ import numpy as np
 
 from ...foundation import store
 from ...foundation.errors import InputError
-from ...geometry.rig import Rig
+from ...geometry.rig import MOST_CAMERAS, Rig
 from .reading import NO_UNIT, make_camera, numbers, plain, text_of
 
 # Parameters of each model: which of fx fy cx cy k1 k2 p1 p2 k3 they are, in order; "f" is both fx and fy.
@@ -22,6 +22,8 @@ MODELS = {
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
+
+LEAST_QUATERNION = 0.1  # its length is 1
 
 
 def read(path: Path) -> Rig:
@@ -42,6 +44,8 @@ def read(path: Path) -> Rig:
         if line[8] not in interior:
             raise InputError(f"Image {line[0]} in {folder / 'images.txt'} names camera {line[8]}, which cameras.txt lacks.")
         size, matrix, distortions = interior[line[8]]
+        if np.linalg.norm(values[:4]) < LEAST_QUATERNION:
+            raise InputError(f"Image {line[0]} in {folder / 'images.txt'} has no rotation: its quaternion is zero.")
         R = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
         image = Path(" ".join(line[9:]))
         names.append(image.parent / image.stem)
@@ -54,16 +58,22 @@ def read(path: Path) -> Rig:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    return [line.split() for line in text_of(path).splitlines() if line.strip() and not line.startswith("#")]
+    return _split([line for line in text_of(path).splitlines() if line.strip() and not line.startswith("#")], path)
 
 
 def _image_lines(path: Path) -> list[list[str]]:
     """Every other line: the second of an image holds its points and may be empty."""
     lines = [line for line in text_of(path).splitlines() if not line.startswith("#")]
-    found = [line.split() for line in lines[0::2] if line.strip()]
-    if any(len(line) < 10 for line in found):
-        raise InputError(f"{path} is damaged: an image needs ten entries, and a second line, which may be empty.")
+    found = _split([line for line in lines[0::2] if line.strip()], path)
+    if any(len(line) < 10 for line in found) or any(len(line.split()) % 3 for line in lines[1::2]):
+        raise InputError(f"{path} is damaged: an image needs ten entries, and a second line, of three numbers a point or empty.")
     return found
+
+
+def _split(lines: list[str], path: Path) -> list[list[str]]:
+    if len(lines) > MOST_CAMERAS:
+        raise InputError(f"{path} has {len(lines)} cameras; a rig has at most {MOST_CAMERAS}. Leave out those that are not used.")
+    return [line.split() for line in lines]
 
 
 def _interior(line: list[str], folder: Path) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
@@ -71,7 +81,7 @@ def _interior(line: list[str], folder: Path) -> tuple[tuple[float, float], np.nd
         known = ", ".join(MODELS)
         raise InputError(f"Camera {line[0]} in {folder / 'cameras.txt'} has an unknown model {line[1:2]}; use one of {known}.")
     names = MODELS[line[1]].split()
-    values = numbers(line[2 : 4 + len(names)], (2 + len(names),), f"Camera {line[0]} in {folder / 'cameras.txt'}")
+    values = numbers(line[2:], (2 + len(names),), f"Camera {line[0]} in {folder / 'cameras.txt'}")
     p = dict(zip(names, values[2:]))
     if any(p.get(k) for k in ("k4", "k5", "k6")):
         raise InputError(f"Camera {line[0]} in {folder / 'cameras.txt'} uses k4, k5 or k6; calibrate with OPENCV or fewer.")

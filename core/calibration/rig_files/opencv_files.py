@@ -11,7 +11,7 @@ Read by ourselves: OpenCV's own parser writes beyond its memory on damaged files
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from ...geometry.rotation import rotation_from_vector, vector_from_rotation
 from .reading import five, make_camera, numbers, plain, text_of
 
 NAMES = re.compile(r'"([^"]*)"|([^\s",]+)')
+STEREO_SIZE = ("image_width", "width"), ("image_height", "height")
 MOST_LINES, LARGEST_MATRIX = 200_000, 10_000
 Entry = np.ndarray | float | str | list[str]
 
@@ -144,13 +145,24 @@ def read(path: Path) -> Rig:
     if names and nodes.has(f"K_{names[0]}"):
         return read_easymocap(path)
     if names:
-        return Rig(cameras=tuple(_of_rig(nodes, name) for name in names))
+        cameras = tuple(_of_rig(nodes, name) for name in names)
+        return _rig(cameras, [nodes.number(f"image_{side}_{name}") for name in names for side in ("width", "height")])
     if nodes.has("M1") and nodes.has("M2"):
-        return Rig(cameras=_stereo(path, nodes))
+        return _rig(_stereo(path, nodes), [nodes.number(*words) for words in STEREO_SIZE])
     K = nodes.matrix("camera_matrix" if nodes.has("camera_matrix") else "K", (3, 3))
     D = nodes.matrix("distortion_coefficients" if nodes.has("distortion_coefficients") else "D", (-1,))
-    size = _size(K, nodes.number("image_width", "image_Width"), nodes.number("image_height", "image_Height"))
-    return Rig(cameras=(make_camera(path.stem, size, K, five(D, f"The distortion in {path}"), np.eye(3), np.zeros(3)),))
+    sides = [nodes.number("image_width", "image_Width"), nodes.number("image_height", "image_Height")]
+    camera = make_camera(path.stem, _size(K, *sides), K, five(D, f"The distortion in {path}"), np.eye(3), np.zeros(3))
+    return _rig((camera,), sides)
+
+
+def _rig(cameras: tuple[Camera, ...], sides: Sequence[float | None]) -> Rig:
+    """The rig, with a note if a file lacks `sides` of images."""
+    if all(sides):
+        return Rig(cameras=cameras)
+    sizes = ", ".join(f"{camera.name} {camera.size_px[0]}×{camera.size_px[1]}" for camera in cameras)
+    note = f"The file lacks the images' sizes, so the principal points were taken as their centres ({sizes}); compare with the footage."
+    return Rig(cameras=cameras, metadata={"notes": [note]})
 
 
 def _size(K: np.ndarray, width: float | None, height: float | None) -> tuple[float, float]:
@@ -173,7 +185,7 @@ def _of_rig(nodes: Nodes, name: str) -> Camera:
 def _stereo(path: Path, nodes: Nodes) -> tuple[Camera, Camera]:
     """M1 D1 M2 D2, and R T here or in extrinsics.yml next to it."""
     pose = nodes if nodes.has("R") else Nodes(path.with_name("extrinsics" + path.suffix))
-    width, height = nodes.number("image_width", "width"), nodes.number("image_height", "height")
+    width, height = (nodes.number(*words) for words in STEREO_SIZE)
     poses = ((np.eye(3), np.zeros(3)), (pose.matrix("R", (3, 3)), pose.matrix("T", (3,))))
     made = []
     for n, (R, t) in enumerate(poses, start=1):
@@ -207,6 +219,8 @@ def read_easymocap(path: Path) -> Rig:
     """
     folder = path if path.is_dir() else path.parent
     inner, outer = Nodes(folder / "intri.yml"), Nodes(folder / "extri.yml")
+    if outer.names() and inner.names() and {*outer.names()} != {*inner.names()}:
+        raise InputError(f"intri.yml and extri.yml in {folder} name different cameras; give both the same list “names”.")
     cameras = []
     for name in inner.names():
         K = inner.matrix(f"K_{name}", (3, 3))
@@ -216,7 +230,7 @@ def read_easymocap(path: Path) -> Rig:
         cameras.append(make_camera(name, size, K, five(D, f"The distortion of {name}"), R, outer.matrix(f"T_{name}", (3,))))
     if not cameras:
         raise InputError(f"{folder / 'intri.yml'} names no cameras; it needs the list “names”.")
-    return Rig(cameras=tuple(cameras))
+    return _rig(tuple(cameras), [inner.number(f"{side}_{name}") for name in inner.names() for side in "WH"])
 
 
 def write_easymocap(folder: Path, rig: Rig) -> list[Path]:

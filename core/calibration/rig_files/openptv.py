@@ -22,6 +22,7 @@ from ...geometry.rotation import axis_rotation, rotation_from_vector
 from .reading import fitted, make_camera, numbers, text_of, turned
 
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+SAME_ROTATION = 1e-3  # between entries of the two matrices of a file
 PIXEL_MM = 0.01  # of a file that we write: only products with it matter
 
 
@@ -72,6 +73,8 @@ def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) ->
     values = numbers(text_of(file).split()[:18], (18,), f"The orientation in {file}")
     extra = file.with_suffix(".addpar")
     p = numbers(text_of(extra).split()[:7], (7,), f"The parameters in {extra}")
+    if np.abs(values[6:15].reshape(3, 3) - _rotation(*values[3:6])).max() > SAME_ROTATION:
+        raise InputError(f"The angles and the matrix in {file} are two different rotations; write it with OpenPTV again.")
     R = TO_OPENCV @ values[6:15].reshape(3, 3).T
     k1, k2, k3, p1, p2, scx, she = p
     parameters = np.array([values[15], values[16], values[17], k1, k2, k3, p1, p2, scx, she])
@@ -96,6 +99,11 @@ def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) ->
     fitted_camera = camera_of(name, size, interior, np.eye(3), np.zeros(3))
     t = -R @ (values[:3] / 1000)
     return make_camera(name, size, fitted_camera.matrix, fitted_camera.distortions, R, t, fitted_camera.affinity)
+
+
+def _rotation(omega: float, phi: float, kappa: float) -> np.ndarray:
+    """The matrix (3, 3) of the angles [rad] of an .ori file."""
+    return axis_rotation("x", omega) @ axis_rotation("y", phi) @ axis_rotation("z", kappa)
 
 
 def _rays(p: np.ndarray, size: tuple[int, int], pixel_mm: tuple[float, float]) -> np.ndarray:
@@ -138,7 +146,7 @@ def write(folder: Path, rig: Rig) -> list[Path]:
         p, posed = _fitted(camera)
         R = (TO_OPENCV @ posed.R_cam_world).T
         omega, phi, kappa = np.arctan2(-R[1, 2], R[2, 2]), np.arcsin(np.clip(R[0, 2], -1, 1)), np.arctan2(-R[0, 1], R[0, 0])
-        R = axis_rotation("x", omega) @ axis_rotation("y", phi) @ axis_rotation("z", kappa)
+        R = _rotation(omega, phi, kappa)
         blocks = [posed.centre_m * 1000, np.array([omega, phi, kappa]), None, *R, None, p[:2], p[2:3], None, np.array([0.0, 0.0, 0.0001])]
         lines = ["" if b is None else " ".join(repr(float(v)) for v in b) for b in blocks]
         paths += [folder / f"{camera.name}.ori", folder / f"{camera.name}.addpar"]

@@ -38,6 +38,11 @@ def text_of(path: Path) -> str:
     return text
 
 
+def noted(cameras: Sequence[str], why: str) -> dict[str, list[str]]:
+    """The entry `notes` of a rig's metadata that names cameras of a file that were left out; empty if none was."""
+    return {"notes": [f"Left out, because {why}: {', '.join(cameras)}."]} if cameras else {}
+
+
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Finite numbers of a shape; a -1 in the shape stands for any length.
 
@@ -80,7 +85,7 @@ def make_camera(
     """A camera, checked.
 
     Raises:
-        InputError: it is impossible: no focal length, no size, a large skew, a matrix that is none of a camera or does not turn.
+        InputError: it is impossible: its focal length, size, skew or rotation is none that a camera has.
     """
     if not is_camera_matrix(matrix) or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
         raise InputError(
@@ -88,6 +93,8 @@ def make_camera(
             f"{LARGEST_SKEW:g} of the focal length."
         )
     matrix = np.vstack([np.triu(matrix)[:2], [0.0, 0.0, 1.0]])  # without what was rounded
+    if any(round(side) != side for side in size_px):
+        raise InputError(f"Camera “{name}” has a size of {size_px[0]:g}×{size_px[1]:g} pixels; whole numbers are needed.")
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")
     return Camera(

@@ -16,7 +16,7 @@ from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, sigmas_of
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, numbers, plain, text_of
+from .reading import five, make_camera, noted, numbers, plain, text_of
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
@@ -37,11 +37,14 @@ def read(path: Path) -> Rig:
         raise InputError(f"{path} is in an unknown unit “{unit}”; write one of {', '.join(UNITS_M)} under [metadata].")
     entries = table["cameras"] if isinstance(table.get("cameras"), dict) else table
     finished = {k: e for k, e in entries.items() if isinstance(e, dict) and "matrix" in e and e.get("rotation") is not None}
+    ignored = [key for key, entry in finished.items() if entry.get("ignore") is True]
+    finished = {key: entry for key, entry in finished.items() if key not in ignored}
     cameras = {key: _camera(key, entry, path, UNITS_M[unit]) for key, entry in finished.items()}
     if not cameras:
         raise InputError(f"{path} has no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
     sigmas = {cameras[k].name: sigmas_of(e["sigma"], cameras[k].name, path) for k, e in finished.items() if "sigma" in e}
-    return Rig(cameras=tuple(cameras.values()), metadata=metadata if isinstance(metadata, dict) else {}, sigmas=sigmas)
+    notes = noted([str(entries[key].get("name", key)) for key in ignored], "they are marked `ignore`")
+    return Rig(cameras=tuple(cameras.values()), metadata=(metadata if isinstance(metadata, dict) else {}) | notes, sigmas=sigmas)
 
 
 def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camera:
@@ -56,6 +59,8 @@ def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camer
         raise InputError(f"Camera “{name}” in {path} has a fisheye lens with more than k1, k2, k3, k4; calibrate it again.")
     rotation = np.asarray(entry["rotation"], dtype=object)
     R = numbers(entry["rotation"], (3, 3), f"“rotation” {label}") if rotation.shape == (3, 3) else None
+    if R is None and np.linalg.norm(numbers(entry["rotation"], (3,), f"“rotation” {label}")) > 2 * np.pi:
+        raise InputError(f"“rotation” {label} is longer than a whole turn; it is a Rodrigues vector in radians, not in degrees.")
     affinity = numbers(entry["affinity"], (2,), f"“affinity” {label}") if "affinity" in entry else None
     return make_camera(
         name,

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...foundation import bounded, store
-from ...foundation.errors import InputError
+from ...foundation.errors import InputError, damage_of
 from ..plausible import check_places, check_span
 from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
@@ -219,7 +219,7 @@ def _opened(path: Path, read: Callable[[bytes], Found]) -> Found:
     try:
         return read(data)
     except (struct.error, IndexError, ValueError, KeyError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is a damaged C3D file ({error}); export it again.") from error
+        raise InputError(f"{path} is a damaged C3D file ({damage_of(error)}); export it again.") from error
 
 
 def _read_segments(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Segments | None:

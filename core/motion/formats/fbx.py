@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ...foundation import bounded
-from ...foundation.errors import InputError
+from ...foundation.errors import InputError, damage_of
 
 MAGIC = b"Kaydara FBX Binary  \0\x1a\0"
 WIDE_FROM = 7500  # the version from which words have 64 bits
@@ -40,7 +40,10 @@ def check_fbx(path: Path) -> None:
     """
     try:
         with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
-            if file.read(len(MAGIC)) == MAGIC:
+            start = file.read(len(MAGIC))
+            if not start:
+                raise ValueError("it is empty")
+            if start == MAGIC:
                 walk = _Walk(file, path)
                 walk.all()
                 for name in walk.pictures:
@@ -48,7 +51,7 @@ def check_fbx(path: Path) -> None:
                 if max(_paths(walk.joined), _actions(walk.joined, walk.layers)) > MOST_PATHS:
                     raise InputError(f"{path} connects its objects in more than {MOST_PATHS} ways; export the rig alone.")
     except (OSError, ValueError, struct.error, zlib.error, RecursionError) as error:
-        raise InputError(f"{path} is not an FBX file that can be read ({error}); it is damaged, export it again.") from error
+        raise InputError(f"{path} is not an FBX file that can be read ({damage_of(error)}); it is damaged, export it again.") from error
 
 
 class _Walk:

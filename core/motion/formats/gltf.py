@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...foundation import bounded
-from ...foundation.errors import InputError
+from ...foundation.errors import InputError, damage_of
 
 DEEPEST = 200  # nodes in each other
 MOST_NODES = 10_000  # and instances, each of which becomes an object, and shapes of meshes
@@ -53,7 +53,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def unreadable(path: Path, error: Exception) -> InputError:
     """The sentence about a file with a fault of that kind."""
-    return InputError(f"{path} is not a VRM or glTF file that can be read ({error}); export it again.")
+    return InputError(f"{path} is not a VRM or glTF file that can be read ({damage_of(error)}); export it again.")
 
 
 def check_gltf(path: Path) -> None:

@@ -17,10 +17,10 @@ import numpy as np
 
 from ...foundation import bounded, store
 from ...foundation.arrays import frozen
-from ...foundation.errors import InputError
+from ...foundation.errors import InputError, damage_of
 from ...images.interlace import frame_time_s
 from ..plausible import check_places, check_times
-from ..tables import read_joints
+from ..tables import JOINT_COLUMNS, SIGMA, read_joints
 
 AXES = {
     "Z up": np.eye(3),
@@ -152,9 +152,11 @@ def _read(path: Path) -> Markers:
         text = io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))
         header = [name.strip() for name in next(csv.reader(text), [])]
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read the table {path}: {getattr(error, 'strerror', None) or error}.") from error
+        raise InputError(f"Cannot read the table {path}: {damage_of(error)}.") from error
     if "joint" in header:
-        table = read_joints(path)
+        if lacking := [name for name in JOINT_COLUMNS if name not in header and name != SIGMA]:
+            raise InputError(f"{path} has no column “{lacking[0]}”; write {', '.join(JOINT_COLUMNS[:-1])}, and sigma where it is known.")
+        table = read_joints(path, needs_sigma=SIGMA in header)
         frames, names = table.frames, tuple(table.joints_m)
         if not names:
             raise InputError(f"The table {path} has no rows; choose one with points.")

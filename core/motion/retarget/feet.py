@@ -26,6 +26,7 @@ from .contacts import Contacts, FeetSettings, runs, stance
 from .mapping import RigMap
 from .rig import Rig
 from .roles import sided
+from .transfer import stood_up
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -60,7 +61,7 @@ class Limb:
 class Leg:
     """One leg of the target on its floor: bones by index, and the points of its foot that touch the floor."""
 
-    rig: Rig
+    rig: Rig  # that stands in its rest pose
     floor_m: float  # height of the floor
     side: str
     thigh: tuple[int, ...]
@@ -79,8 +80,8 @@ class Leg:
 
 
 def find_legs(rig: Rig, rig_map: RigMap, floor_m: float) -> dict[str, Leg]:
-    """The target's legs that have thigh, shin and foot."""
-    legs = {}
+    """The target's legs that have thigh, shin and foot, of its rig as it stands (`stood_up`), `floor_m` being the floor under it."""
+    legs, rig = {}, stood_up(rig, rig_map)
     for side in ("L", "R"):
         bones = {part: tuple(rig.index[n] for n in rig_map.bones.get(sided(part, side), ())) for part in ("thigh", "shin", "foot", "toe")}
         if bones["thigh"] and bones["shin"] and bones["foot"]:

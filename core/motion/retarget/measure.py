@@ -79,7 +79,7 @@ def _feet(target: MappedMotion, contacts: Contacts | None, floor_m: float) -> tu
     for side, leg in find_legs(motion.rig, target.map, floor_m).items():
         foot = leg.foot[0]
         ankle = motion.head_m[:, foot]
-        ball = ankle + motion.R[:, foot] @ (motion.rig.R_rest[foot].T @ (leg.ball_m - motion.rig.head_m[foot]))
+        ball = ankle + motion.R[:, foot] @ (leg.rig.R_rest[foot].T @ (leg.ball_m - leg.rig.head_m[foot]))
         height = ankle[:, 2] + lowest(leg, motion.R) - floor_m
         sunk = max(sunk, float(-height.min()))
         if contacts is None or side not in contacts.sides:

@@ -12,7 +12,7 @@ nearest to its own, so that a round trip is exact; the bones between get D inter
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, side
 UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans by less counts as upright
 LEVEL = 0.35  # a foot whose direction has a smaller horizontal component has no heading
 LONE_FOREARM = 0.5  # fraction of the hand's twist that a forearm without twist bones takes
+GROUND_AT_ORIGIN = 0.1  # fraction of a rig's height: if its feet are nearer to its origin, that is on the ground, else its feet are
 SAME_DEG = 0.05  # between a posed part and its source: no offset
 SHORTEST_M = 1e-9  # bones below this length count as equally long
 
@@ -70,6 +71,29 @@ def body_axes(rig: Rig, rig_map: RigMap) -> np.ndarray:
         across = np.array([1.0, 0.0, 0.0]) - up * up[0]
     left = unit(across)
     return np.stack([left, np.cross(up, left), up], axis=1)
+
+
+def standing_turn(rig: Rig, rig_map: RigMap) -> np.ndarray:
+    """The rotation (3, 3) about the world's origin by which a rig stands that lies in its rest pose, or stands on its head; else none."""
+    up = body_axes(rig, rig_map)[:, 2]
+    return np.eye(3) if up[2] == 1.0 else shortest(up, np.array([0.0, 0.0, 1.0]))
+
+
+def stood_up(rig: Rig, rig_map: RigMap) -> Rig:
+    """The rig itself, or one that was turned so that its rest pose stands (`standing_turn`), on the ground at height 0."""
+    turn = standing_turn(rig, rig_map)
+    if (turn == np.eye(3)).all():
+        return rig
+    head_m, tail_m = rig.head_m @ turn.T, rig.tail_m @ turn.T
+    soles = {name: points @ turn.T for name, points in rig.sole_m.items()}
+    stands = replace(rig, R_rest=turn @ rig.R_rest, head_m=head_m, tail_m=tail_m, sole_m=soles)
+    lift = np.array([0.0, 0.0, 0.0 if abs(low := lowest_m(stands)) < GROUND_AT_ORIGIN * stands.height_m else -low])
+    return replace(stands, head_m=head_m + lift, tail_m=tail_m + lift, sole_m={name: points + lift for name, points in soles.items()})
+
+
+def lowest_m(rig: Rig) -> float:
+    """The height of a rig's soles, or else of its lowest joint, in the rest pose."""
+    return min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
 
 
 def direction(rig: Rig, rig_map: RigMap, role: str) -> np.ndarray | None:

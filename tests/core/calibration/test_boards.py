@@ -332,6 +332,14 @@ def test_images_belong_together_by_their_number(tmp_path: Path) -> None:
     assert [n.tolist() for n in open_boards(tmp_path).numbers] == [[1, 2, 4], [2, 3, 4]]
 
 
+def test_what_cannot_be_printed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Markers without a pixel for each of their cells ended in OpenCV's words."""
+    board = ["calibrate", "--board", "charuco", "--squares", "7x5", "--square", "0.04", "--print", str(tmp_path / "b.png")]
+    for more, said in ((["--marker", "0.0001"], "too small to be drawn"), (["--out", "rig.toml"], "--out belongs to a calibration")):
+        assert main([*board, *more]) == 2 and said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("ending", [".png", ".pdf"])
 def test_a_board_is_printed_in_its_size(ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"board{ending}"
@@ -358,6 +366,8 @@ def test_a_board_is_printed_in_its_size(ending: str, tmp_path: Path) -> None:
         (["--board", "charuco", "--squares", "20x20", "--square", "0.1"], "200 markers"),
         (["--board", "charuco", "--squares", "5x5", "--square", "0.1", "--marker", "0.2"], "smaller than the squares"),
         (["--board", "chessboard", "--squares", "9x6", "--square", "0.1", "--bar-length", "1"], "belongs to a bar"),
+        (["--board", "chessboard", "--squares", "9x6", "--square", "0.1", "--marker", "0.02"], "a chessboard has none"),
+        (["--board", "charuco", "--squares", "5x5", "--square", "0.1", "--marker", "0"], "--marker 0 is no side of a marker"),
     ],
 )
 def test_what_is_no_board_is_refused(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

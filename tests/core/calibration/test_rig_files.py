@@ -1,5 +1,6 @@
 """Other tools' files: what is written is read again; files as those tools write them are understood; broken ones are refused."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, read_any, write_as
+from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, notes_of, read_any, write_as
 from tricap.core.calibration.rig_files.openptv import image
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.camera import Camera
@@ -222,6 +223,67 @@ def test_colmap_file(tmp_path: Path) -> None:
     assert camera.matrix[0].tolist() == [2559.81, 0.0, 1535.5] and camera.distortions[0] == -0.0218531
     w, x, y, z = (float(v) for v in pose.split()[:4])
     assert camera.R_cam_world[0, 1] == pytest.approx(2 * (x * y - w * z), abs=1e-5)
+
+
+@pytest.mark.parametrize(("changed", "said"), [
+    (("images.txt", "1 0.851773 0.0165051 0.503764 -0.142941", "1 0 0 0 0"), "Image 1 in .* has no rotation: its quaternion is zero"),
+    (("images.txt", "\n\n", "\n"), "an image needs ten entries, and a second line, of three numbers a point or empty"),
+    (("cameras.txt", "1152 -0.02", "1152 -0.02 1 2"), "Camera 1 in .* must be 6 numbers"),
+    (("cameras.txt", "1 SIMPLE_RADIAL", "\n".join(["1 PINHOLE 8 8 1 1 1 1"] * 201)), "cameras.txt has 201 cameras; a rig has at most 200"),
+])  # fmt: skip
+def test_colmap_files_that_contradict_themselves(tmp_path: Path, changed: tuple[str, str, str], said: str) -> None:
+    """A zero quaternion ended in a traceback; a file without the lines of points lost every other camera."""
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 3072 2304 2559.81 1536 1152 -0.02\n")
+    line = "0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1"
+    (tmp_path / "images.txt").write_text(f"1 {line} L.png\n\n2 {line} R.png\n\n")
+    assert [camera.name for camera in read_any(tmp_path).cameras] == ["L", "R"]
+    name, old, new = changed
+    text = (tmp_path / name).read_text()
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=said):
+        read_any(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "old", "new", "note"), [
+    ("agisoft", "<transform>", "<other>", "Left out, because they are not aligned in Metashape: L."),
+    ("caliscope", "rotation_count = 0", "ignore = true", "Left out, because they are marked `ignore`: L."),
+    ("easymocap", "W_L:", "w_L:", "The file lacks the images' sizes, so the principal points were taken as their centres"),
+])  # fmt: skip
+def test_what_is_left_out_or_taken_for_granted_is_told(name: str, old: str, new: str, note: str, tmp_path: Path) -> None:
+    write_as(target(tmp_path, name), Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras())), name)
+    path = target(tmp_path, name) / "intri.yml" if name == "easymocap" else target(tmp_path, name)
+    first, found, rest = path.read_text().partition(old)
+    if name == "agisoft":
+        rest = rest.replace("</transform>", "</other>", 1)
+    assert found and not notes_of(read_any(path))
+    path.write_text(first + new + rest)
+    (said,) = notes_of(read_any(path))
+    assert said.startswith(note)
+
+
+@pytest.mark.parametrize(("name", "inside", "old", "new", "said"), [
+    ("agisoft", "", "<p1>", "<p3>0.5</p3><p1>", "uses p3"),
+    ("anipose", "", r"size = \[768, ", "size = [768.5, ", "whole numbers are needed"),
+    ("caliscope", "", r"rotation = \[", "rotation = [90.0, 0.0, 0.0] # [", "radians, not in degrees"),
+    ("easymocap", "extri.yml", "L", "Lx", "name different cameras"),
+    ("openptv", "L.ori", r"\n.*\n\n", r"\n0.5 0.4 0.3\n\n", "are two different rotations"),
+])  # fmt: skip
+def test_files_that_contradict_themselves_are_refused(name: str, inside: str, old: str, new: str, said: str, tmp_path: Path) -> None:
+    write_as(target(tmp_path, name), Rig(cameras=benchmark_cameras()), name)
+    path = target(tmp_path, name) / inside
+    text, count = re.subn(old, new, path.read_text(), count=0 if name == "easymocap" else 1)
+    path.write_text(text)
+    assert count
+    with pytest.raises(InputError, match=said):
+        read_any(path)
+
+
+@pytest.mark.parametrize(("name", "file"), [("opencv", "rig"), ("agisoft", "rig.yml"), ("anipose", "rig.xml")])
+def test_a_name_by_which_the_format_is_not_found_again_is_refused(name: str, file: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"{file} is no name of a file of {name}; let it end in"):
+        write_as(tmp_path / file, Rig(cameras=benchmark_cameras()), name)
+    assert not list(tmp_path.iterdir())
 
 
 ORI = """  101.6620   -54.7000   -70.0000

@@ -144,6 +144,10 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     coarse = [len((tmp_path / "out" / "contours" / f"{view}.csv").read_text().splitlines()) for view in "LR"]
     assert max(coarse) < 0.7 * len(rows)
     capsys.readouterr()
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert main(["contour", str(take), "--view", "C", "--frames", "0:2", *out]) == 2
+    assert "has results of the frames 0:3, and an outline is tracked in the same ones" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
     assert main(["contour", str(take), "--view", "X", "--out", str(tmp_path / "none"), "--quiet"]) == 2
     assert "“X”" in capsys.readouterr().err
     assert main(["contour", str(take), "--view", "C", "--from-body", *out]) == 2

@@ -113,6 +113,8 @@ def test_frames_that_c3d_cannot_number_are_said(tmp_path: Path, frames: tuple[in
 def test_wide_tables_are_read(tmp_path: Path) -> None:
     (tmp_path / "wide.csv").write_text("frame,time_s,elbow.R x,elbow.R y,elbow.R z\n3,0.1,1,2,3\n4,0.2,,,\n5,0.3,4,5,6\n")
     found = read_points_csv(tmp_path / "wide.csv")
+    (tmp_path / "long.csv").write_text("frame,time_s,joint,x,y,z\n3,0.1,elbow.R,1,2,3\n5,0.3,elbow.R,4,5,6\n")  # without a sigma
+    assert np.isnan(read_points_csv(tmp_path / "long.csv").sigma_m).all()
     assert found.names == ("elbow.R",) and abs(found.fps - 10.0) < 1e-9 and np.isnan(found.xyz_m[1]).all()
 
 
@@ -340,6 +342,12 @@ def test_damaged_points_are_said(tmp_path: Path) -> None:
         ("b.trc", text[:-600].encode(), "promises"),
         ("b.csv", b"", "no columns"),
         ("b.csv", b"a,b\n1,2\n", "no columns"),
+        ("b.csv", b"frame,\x83", "it is not text in UTF-8"),
+        (
+            "b.csv",
+            b"frame,joint,x,y,z\n0,a,1,2,3\n",
+            "no column “time_s”; write frame, time_s, joint, x, y, z, and sigma where",
+        ),
         ("b.csv", b"frame,p x,p y,p z\n1,2\n", "rows"),
         ("b.xyz", b"", "not a motion that can be read"),
     ]

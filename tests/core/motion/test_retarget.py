@@ -22,7 +22,7 @@ from tricap.core.geometry.rotation import (
     transposed,
 )
 from tricap.core.motion.formats.bvh import write_bvh
-from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, planted, steady, without_short
+from tricap.core.motion.retarget.contacts import FeetSettings, find_contacts, hysteresis, planted, steady, without_short
 from tricap.core.motion.retarget.feet import Stand, carry_root
 from tricap.core.motion.retarget.mapping import RigMap, find_map
 from tricap.core.motion.retarget.measure import measure
@@ -246,6 +246,20 @@ def test_feet_that_stand_stay_on_legs_of_other_proportions() -> None:
     assert measure(mapped(source, maps[0]), mapped(loose.motion, maps[1]), firm.contacts).slide_mm > 20.0
     assert figures.slide_mm < 0.1 and figures.penetration_mm < 0.1 and figures.float_mm < 0.1, figures
     assert figures.direction_rms_deg < 1.0, figures
+
+
+@pytest.mark.parametrize("turn_deg", [(90, 0, 0), (-90, 0, 0), (0, 90, 0), (180, 0, 0), (60, 20, 130)], ids=str)
+def test_a_rig_that_lies_in_its_rest_pose_stands_as_one_that_stood(turn_deg: tuple[int, int, int]) -> None:
+    """Its soles were taken where they are in the rest pose: feet turned by up to 149° from one frame to the next."""
+    source, upright = squat(person()), person(thigh_part=0.58, size=0.8)
+    U = matrix_from_euler(np.radians(turn_deg), "XYZ")
+    lying = replace(upright, R_rest=U @ upright.R_rest, head_m=upright.head_m @ U.T, tail_m=upright.tail_m @ U.T)
+    rig_map = find_map(upright)
+    stood, lay = (retarget(mapped(source), mapped_rig(rig, rig_map)).motion for rig in (upright, lying))
+    ankles = [upright.index[rig_map.bones[f"foot.{side}"][0]] for side in "LR"]
+    np.testing.assert_allclose(lay.head_m[:, ankles, 2], stood.head_m[:, ankles, 2], atol=1e-3)
+    figures = measure(mapped(source), mapped(lay, rig_map), find_contacts(source, find_map(source.rig), FeetSettings(), 0.9))
+    assert figures.slide_mm < 0.1 and figures.penetration_mm < 0.1 and figures.float_mm < 0.1, figures
 
 
 def test_a_body_in_the_air_does_not_go_on_as_its_feet_had_it_move() -> None:
