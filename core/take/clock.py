@@ -163,7 +163,10 @@ def read_timestamps(path: Path, view: str) -> np.ndarray:
     try:
         times = np.array([float(row[column]) for row in rows], dtype=np.float64)
         if ORDER_COLUMN in header:
-            times = times[np.argsort([int(row[ORDER_COLUMN]) for row in rows], kind="stable")]
+            order = np.unique([int(row[ORDER_COLUMN]) for row in rows], return_index=True)[1]
+            if len(order) < len(times):
+                raise InputError(f"{path} has two time stamps of one image of view {view}; remove one of them.")
+            times = times[order]
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a row of view {view} that is not a number in “{column}”; correct it.") from error
     if len(times) < 2 or not np.isfinite(times).all() or np.abs(times).max() > 1e12:

@@ -52,6 +52,7 @@ def test_time_stamps_of_one_or_several_views_are_read_in_the_order_of_the_images
         ("time_s\n1\nhello\n", "not a number"),
         ("view,time_s\nL,1\nL\n", "not a number"),
         ("time_s\n1\n2\n2\n", "do not increase after image 1"),
+        ("frame_index,time_s\n0,0\n0,0.04\n2,0.08\n", "two time stamps of one image of view"),
         ("time_s\n1\n2\n", "has 2 time stamps of view L, which has 3 images"),
         ("time_s,\0x\n\0", "Cannot read|no time stamps|not a number"),
     ],
