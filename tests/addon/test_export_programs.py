@@ -207,10 +207,12 @@ def test_a_file_that_was_not_named_is_not_replaced(tmp_path: Path) -> None:
 def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not UTF-8; rename it"):
         named_for("glb", tmp_path / "a\udcff.glb", None)
-    named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLTF"): "a.GLTF", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
+    named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLB"): "a.GLB", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
     assert {key: named_for(key[0], Path(key[1]), tmp_path).name for key in named} == named
     with pytest.raises(InputError, match="q.xyz does not end in .usd or .usda or .usdc or .usdz; write the name with that ending"):
         named_for("usd", Path("q.xyz"), tmp_path)
+    with pytest.raises(InputError, match="a.gltf does not end in .glb"):  # of which Blender makes a.gltf.glb
+        named_for("glb", Path("a.gltf"), tmp_path)
     with pytest.raises(InputError, match="a.fbx has the ending of another format; let it end in .trc"):
         named_for("trc", Path("a.fbx"), tmp_path)
     for slip in ("0000.png", "take.toml", "film.MP4", "body.blend"):
