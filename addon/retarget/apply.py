@@ -14,12 +14,13 @@ from ...core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, app
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig, controls_of
-from ...core.motion.retarget.transfer import GROUND_AT_ORIGIN, lowest_m, stood_up
+from ...core.motion.retarget.transfer import lowest_m, stood_up
 from . import saved_maps
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, store_residual_motion, write_action
 
+FLOOR_AT_ORIGIN = 0.1  # fraction of a rig's height: if its feet are nearer to its origin, the floor is at the origin, else under its feet
 CHECKED_FRAMES = 9  # of the action, spread evenly
 TOLERANCE_DEG = 0.5  # between the pose that was keyed and the one that Blender plays
 
@@ -86,7 +87,7 @@ def _floor_m(rig: Rig, rig_map: RigMap, origin_m: float) -> float:
     if stood_up(rig, rig_map) is not rig:
         return 0.0
     low = lowest_m(rig)
-    return origin_m if abs(low - origin_m) < GROUND_AT_ORIGIN * rig.height_m else low
+    return origin_m if abs(low - origin_m) < FLOOR_AT_ORIGIN * rig.height_m else low
 
 
 def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:

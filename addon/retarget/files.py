@@ -1,6 +1,5 @@
 """Rigs and motions from files: .blend, glTF, VRM and FBX through Blender's importers, the rest through core's readers."""
 
-import builtins
 import re
 import shutil
 import tempfile
@@ -29,6 +28,7 @@ from .build import build_armature
 from .programs import is_imported_by_blender
 from .read import action_frames, read_motion, read_rig, with_residual_motion
 
+FAULTS = ("AttributeError", "TypeError", "KeyError", "IndexError", "NameError", "AssertionError", "ZeroDivisionError")  # of an importer
 RIG_FILES = (".blend", ".glb", ".gltf", ".vrm", ".fbx", ".bvh")
 
 
@@ -188,7 +188,7 @@ def _reason(error: Exception) -> str:
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line) and not line.endswith(":")]
     if not reasons and "Traceback" in str(error):
         return "its importer fails"
-    if reasons and hasattr(builtins, name := reasons[-1].partition(":")[0]) and name != "RuntimeError":  # a bug of the importer's
+    if reasons and reasons[-1].startswith(FAULTS):
         return "its importer fails"
     return (reasons or lines or [type(error).__name__])[-1][:200]
 

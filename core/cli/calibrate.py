@@ -13,7 +13,7 @@ from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import Start, Starts, calibrate_rig, check_report, measure_bar, open_bar, open_boards, write_report
-from ..calibration.rig_files import FOLDERS, lens_note, notes_of, read_any, write_as
+from ..calibration.rig_files import FOLDERS, check_place, lens_note, notes_of, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
@@ -21,7 +21,6 @@ from ..foundation.progress import Monitor
 from ..geometry.rig import Rig, read_rig, write_rig
 from ..images.interlace import BOTH
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
-from ..results.listed_files import check_files
 from ..results.outputs import check_output, check_replaceable
 from ..take.bar_file import STARTS, bar_path, write_bar
 from ..tracking.point_tables import read_points
@@ -156,7 +155,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
     if args.report:
         check_report(args.report)
     if args.format:
-        check_files(args.out, FOLDERS.get(args.format, ()))
+        check_place(args.out, args.format)
     world = _world(args)
     result = calibrate_rig(_observed(args, board, monitor), monitor, focal_px=args.focal_px, lens=Lens(args.lens), world=world)
     written = [args.out]

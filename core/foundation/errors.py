@@ -1,6 +1,9 @@
 """The error that a user can correct, and the sentence for faults of the computer. Any other exception is a bug."""
 
+import csv
 import json
+import struct
+import zlib
 from datetime import date, time
 
 NO_MEMORY = -4  # OpenCV's code
@@ -30,16 +33,18 @@ def shown(value: object) -> str:
 
 
 def damage_of(error: Exception) -> str:
-    """What is wrong with a file that a reader could not read: the words of the reader or of the system, not those of Python."""
+    """What is wrong with a file that a reader could not read, in plain words where Python's own would not help."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, UnicodeDecodeError):
         return "it is not text in UTF-8"
-    if isinstance(error, KeyError):
+    if isinstance(error, KeyError) and error.args:
         return f"“{error.args[0]}” is missing"
-    if isinstance(error, IndexError):
+    if isinstance(error, (IndexError, struct.error)):
         return "it ends too early"
-    return str(error) if isinstance(error, (InputError, ValueError)) else "an entry is missing or of a wrong kind"
+    if isinstance(error, zlib.error):
+        return "what is packed in it cannot be unpacked"
+    return str(error) if isinstance(error, (InputError, ValueError, csv.Error)) else "an entry is missing or of a wrong kind"
 
 
 def with_notes(error: BaseException) -> str:

@@ -201,7 +201,7 @@ def open_run(
 
 
 def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> None:
-    """Check that results in a folder are of these frames: contours of others would take surface and tracks away from a fit.
+    """Check that results in a folder are of these frames: contours of others would remove surface and tracks.
 
     Raises:
         InputError: they are of others.
@@ -209,8 +209,8 @@ def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> Non
     first, end = before.get("frames", (frames.start, frames.stop))
     if before.get("stages") and (first, end) != (frames.start, frames.stop):
         raise InputError(
-            f"{folder} has results of the frames {first}:{end}, and an outline is tracked in the same ones; give --frames {first}:{end}, "
-            "or another folder with --out."
+            f"{folder} has results of the frames {first}:{end}, and an outline is tracked in the same ones; choose these frames, or "
+            "another folder for the results."
         )
 
 

@@ -149,7 +149,7 @@ class Board:
         if self.kind is BoardKind.CHARUCO:
             least = self.markers.markerSize + 2  # pixels, one for each cell and the border
             if (self.marker_m or MARKER_PART * self.square_m) * side < least * self.square_m:
-                raise InputError(f"Markers of {self.marker_m:g} m are too small to be drawn at {dpi:g} dpi; give a larger --marker.")
+                raise InputError(f"The markers are too small to be drawn at {dpi:g} dpi; choose larger ones, or larger squares.")
             return np.asarray(self.charuco().generateImage(size, marginSize=side, borderBits=1))
         dark = np.indices((rows, columns)).sum(axis=0) % 2 == 0
         squares = np.where(dark, 0, 255).astype(np.uint8)

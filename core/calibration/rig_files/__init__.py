@@ -81,12 +81,11 @@ def _read(path: Path) -> Rig:
     raise InputError(f"{path} is of no known kind; give rig.toml, or a file or folder of {', '.join(sorted(FORMATS))}.")
 
 
-def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
-    """Write a rig in another tool's format; the files that were written.
+def check_place(path: Path, name: str) -> None:
+    """Check that a rig can be written to `path` in this format, before it is made.
 
     Raises:
-        InputError: the format is unknown, cannot hold this rig, or has files of another ending; or files in the folder are not of an
-            earlier call.
+        InputError: the format is unknown, or has files of another ending, or is a folder; or files in it are not of an earlier call.
     """
     if name not in FORMATS:
         raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
@@ -94,13 +93,22 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
         raise InputError(f"{Path(path).name} is no name of a file of {name}; let it end in {' or '.join(ENDINGS[name])}.")
     if name in FOLDERS and Path(path).is_file():
         raise InputError(f"{path} is a file; {name} needs a folder.")
+    check_files(Path(path), FOLDERS.get(name, ()))
+
+
+def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
+    """Write a rig in another tool's format; the files that were written.
+
+    Raises:
+        InputError: as `check_place`, or the format cannot hold this rig.
+    """
+    check_place(path, name)
     check_cameras(rig.cameras, "The rig")
     curved = [camera.name for camera in rig.cameras if camera.fisheye]
     if curved and name not in WITH_FISHEYE:
         raise InputError(f"{name} has no fisheye lens, as camera {curved[0]} has; choose one of {', '.join(WITH_FISHEYE)}.")
     if name not in FOLDERS:
         return FORMATS[name](Path(path), rig)
-    check_files(Path(path), FOLDERS[name])
     written = FORMATS[name](Path(path), rig)
     list_files(Path(path), FOLDERS[name], [file.name for file in written])
     return written

@@ -65,9 +65,15 @@ def _image_lines(path: Path) -> list[list[str]]:
     """Every other line: the second of an image holds its points and may be empty."""
     lines = [line for line in text_of(path).splitlines() if not line.startswith("#")]
     found = _split([line for line in lines[0::2] if line.strip()], path)
-    if any(len(line) < 10 for line in found) or any(len(line.split()) % 3 for line in lines[1::2]):
+    if any(len(line) < 10 for line in found) or not all(map(_are_points, lines[1::2])):
         raise InputError(f"{path} is damaged: an image needs ten entries, and a second line, of three numbers a point or empty.")
     return found
+
+
+def _are_points(line: str) -> bool:
+    """Whether a line has x, y and the number of a point for each point, and no name of an image."""
+    words = line.split()
+    return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
 def _split(lines: list[str], path: Path) -> list[list[str]]:

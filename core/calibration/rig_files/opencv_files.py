@@ -12,6 +12,7 @@ Read by ourselves: OpenCV's own parser writes beyond its memory on damaged files
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, numbers, plain, text_of
+from .reading import five, make_camera, noted, numbers, plain, text_of
 
 NAMES = re.compile(r'"([^"]*)"|([^\s",]+)')
 STEREO_SIZE = ("image_width", "width"), ("image_height", "height")
@@ -161,7 +162,7 @@ def _rig(cameras: tuple[Camera, ...], sides: Sequence[float | None]) -> Rig:
     if all(sides):
         return Rig(cameras=cameras)
     sizes = ", ".join(f"{camera.name} {camera.size_px[0]}×{camera.size_px[1]}" for camera in cameras)
-    note = f"The file lacks the images' sizes, so the principal points were taken as their centres ({sizes}); compare with the footage."
+    note = f"The file lacks the images' sizes, so they were derived from the principal points ({sizes}); compare with the footage."
     return Rig(cameras=cameras, metadata={"notes": [note]})
 
 
@@ -207,7 +208,7 @@ def write(path: Path, rig: Rig) -> list[Path]:
             storage.write(f"R_{camera.name}", camera.R_cam_world.copy())
             storage.write(f"T_{camera.name}", camera.t_cam_world_m.reshape(3, 1).copy())
 
-    store.write_text(path, _storage_text(".xml" if path.suffix == ".xml" else ".yml", rig, fill))
+    store.write_text(path, _storage_text(".xml" if path.suffix.lower() == ".xml" else ".yml", rig, fill))
     return [path]
 
 
@@ -219,8 +220,6 @@ def read_easymocap(path: Path) -> Rig:
     """
     folder = path if path.is_dir() else path.parent
     inner, outer = Nodes(folder / "intri.yml"), Nodes(folder / "extri.yml")
-    if outer.names() and inner.names() and {*outer.names()} != {*inner.names()}:
-        raise InputError(f"intri.yml and extri.yml in {folder} name different cameras; give both the same list “names”.")
     cameras = []
     for name in inner.names():
         K = inner.matrix(f"K_{name}", (3, 3))
@@ -230,7 +229,9 @@ def read_easymocap(path: Path) -> Rig:
         cameras.append(make_camera(name, size, K, five(D, f"The distortion of {name}"), R, outer.matrix(f"T_{name}", (3,))))
     if not cameras:
         raise InputError(f"{folder / 'intri.yml'} names no cameras; it needs the list “names”.")
-    return _rig(tuple(cameras), [inner.number(f"{side}_{name}") for name in inner.names() for side in "WH"])
+    rig = _rig(tuple(cameras), [inner.number(f"{side}_{name}") for name in inner.names() for side in "WH"])
+    surplus = noted([name for name in outer.names() if name not in inner.names()], "intri.yml does not name them")
+    return replace(rig, metadata={"notes": [*rig.metadata.get("notes", []), *surplus["notes"]]}) if surplus else rig
 
 
 def write_easymocap(folder: Path, rig: Rig) -> list[Path]:

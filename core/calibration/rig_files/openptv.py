@@ -22,7 +22,6 @@ from ...geometry.rotation import axis_rotation, rotation_from_vector
 from .reading import fitted, make_camera, numbers, text_of, turned
 
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-SAME_ROTATION = 1e-3  # between entries of the two matrices of a file
 PIXEL_MM = 0.01  # of a file that we write: only products with it matter
 
 
@@ -73,9 +72,7 @@ def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) ->
     values = numbers(text_of(file).split()[:18], (18,), f"The orientation in {file}")
     extra = file.with_suffix(".addpar")
     p = numbers(text_of(extra).split()[:7], (7,), f"The parameters in {extra}")
-    if np.abs(values[6:15].reshape(3, 3) - _rotation(*values[3:6])).max() > SAME_ROTATION:
-        raise InputError(f"The angles and the matrix in {file} are two different rotations; write it with OpenPTV again.")
-    R = TO_OPENCV @ values[6:15].reshape(3, 3).T
+    R = TO_OPENCV @ _rotation(*values[3:6]).T  # as OpenPTV does, which does not read the matrix
     k1, k2, k3, p1, p2, scx, she = p
     parameters = np.array([values[15], values[16], values[17], k1, k2, k3, p1, p2, scx, she])
     f, cx, cy = values[17] / pixel_mm[1], values[15] / pixel_mm[0] + size[0] / 2 - 0.5, size[1] / 2 - values[16] / pixel_mm[1] - 0.5

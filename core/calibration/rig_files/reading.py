@@ -93,8 +93,6 @@ def make_camera(
             f"{LARGEST_SKEW:g} of the focal length."
         )
     matrix = np.vstack([np.triu(matrix)[:2], [0.0, 0.0, 1.0]])  # without what was rounded
-    if any(round(side) != side for side in size_px):
-        raise InputError(f"Camera “{name}” has a size of {size_px[0]:g}×{size_px[1]:g} pixels; whole numbers are needed.")
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")
     return Camera(

@@ -44,6 +44,9 @@ def read(path: Path) -> Rig:
         raise InputError(f"{path} has no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
     sigmas = {cameras[k].name: sigmas_of(e["sigma"], cameras[k].name, path) for k, e in finished.items() if "sigma" in e}
     notes = noted([str(entries[key].get("name", key)) for key in ignored], "they are marked `ignore`")
+    if rounded := [cameras[key].name for key in finished if any(side != round(side) for side in finished[key]["size"])]:
+        said = f"The file has sizes that are no whole pixels, which were rounded ({', '.join(rounded)}); compare with the footage."
+        notes["notes"] = [*notes.get("notes", []), said]
     return Rig(cameras=tuple(cameras.values()), metadata=(metadata if isinstance(metadata, dict) else {}) | notes, sigmas=sigmas)
 
 

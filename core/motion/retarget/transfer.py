@@ -36,7 +36,6 @@ from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, side
 UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans by less counts as upright
 LEVEL = 0.35  # a foot whose direction has a smaller horizontal component has no heading
 LONE_FOREARM = 0.5  # fraction of the hand's twist that a forearm without twist bones takes
-GROUND_AT_ORIGIN = 0.1  # fraction of a rig's height: if its feet are nearer to its origin, that is on the ground, else its feet are
 SAME_DEG = 0.05  # between a posed part and its source: no offset
 SHORTEST_M = 1e-9  # bones below this length count as equally long
 
@@ -80,14 +79,14 @@ def standing_turn(rig: Rig, rig_map: RigMap) -> np.ndarray:
 
 
 def stood_up(rig: Rig, rig_map: RigMap) -> Rig:
-    """The rig itself, or one that was turned so that its rest pose stands (`standing_turn`), on the ground at height 0."""
+    """The rig itself, or one that was turned so that its rest pose stands (`standing_turn`), on the ground at height 0, wherever it lay."""
     turn = standing_turn(rig, rig_map)
     if (turn == np.eye(3)).all():
         return rig
     head_m, tail_m = rig.head_m @ turn.T, rig.tail_m @ turn.T
     soles = {name: points @ turn.T for name, points in rig.sole_m.items()}
     stands = replace(rig, R_rest=turn @ rig.R_rest, head_m=head_m, tail_m=tail_m, sole_m=soles)
-    lift = np.array([0.0, 0.0, 0.0 if abs(low := lowest_m(stands)) < GROUND_AT_ORIGIN * stands.height_m else -low])
+    lift = np.array([0.0, 0.0, -lowest_m(stands)])
     return replace(stands, head_m=head_m + lift, tail_m=tail_m + lift, sole_m={name: points + lift for name, points in soles.items()})
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, notes_of, read_any, write_as
 from tricap.core.calibration.rig_files.openptv import image
+from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
@@ -227,7 +228,7 @@ def test_colmap_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("changed", "said"), [
     (("images.txt", "1 0.851773 0.0165051 0.503764 -0.142941", "1 0 0 0 0"), "Image 1 in .* has no rotation: its quaternion is zero"),
-    (("images.txt", "\n\n", "\n"), "an image needs ten entries, and a second line, of three numbers a point or empty"),
+    (("images.txt", "L.png\n\n", "L x y.png\n"), "an image needs ten entries, and a second line, of three numbers a point or empty"),
     (("cameras.txt", "1152 -0.02", "1152 -0.02 1 2"), "Camera 1 in .* must be 6 numbers"),
     (("cameras.txt", "1 SIMPLE_RADIAL", "\n".join(["1 PINHOLE 8 8 1 1 1 1"] * 201)), "cameras.txt has 201 cameras; a rig has at most 200"),
 ])  # fmt: skip
@@ -248,7 +249,8 @@ def test_colmap_files_that_contradict_themselves(tmp_path: Path, changed: tuple[
 @pytest.mark.parametrize(("name", "old", "new", "note"), [
     ("agisoft", "<transform>", "<other>", "Left out, because they are not aligned in Metashape: L."),
     ("caliscope", "rotation_count = 0", "ignore = true", "Left out, because they are marked `ignore`: L."),
-    ("easymocap", "W_L:", "w_L:", "The file lacks the images' sizes, so the principal points were taken as their centres"),
+    ("anipose", "size = [768, ", "size = [768.4, ", "The file has sizes that are no whole pixels, which were rounded (L)"),
+    ("easymocap", "W_L:", "w_L:", "The file lacks the images' sizes, so they were derived from the principal points"),
 ])  # fmt: skip
 def test_what_is_left_out_or_taken_for_granted_is_told(name: str, old: str, new: str, note: str, tmp_path: Path) -> None:
     write_as(target(tmp_path, name), Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras())), name)
@@ -264,26 +266,43 @@ def test_what_is_left_out_or_taken_for_granted_is_told(name: str, old: str, new:
 
 @pytest.mark.parametrize(("name", "inside", "old", "new", "said"), [
     ("agisoft", "", "<p1>", "<p3>0.5</p3><p1>", "uses p3"),
-    ("anipose", "", r"size = \[768, ", "size = [768.5, ", "whole numbers are needed"),
     ("caliscope", "", r"rotation = \[", "rotation = [90.0, 0.0, 0.0] # [", "radians, not in degrees"),
-    ("easymocap", "extri.yml", "L", "Lx", "name different cameras"),
-    ("openptv", "L.ori", r"\n.*\n\n", r"\n0.5 0.4 0.3\n\n", "are two different rotations"),
 ])  # fmt: skip
 def test_files_that_contradict_themselves_are_refused(name: str, inside: str, old: str, new: str, said: str, tmp_path: Path) -> None:
     write_as(target(tmp_path, name), Rig(cameras=benchmark_cameras()), name)
     path = target(tmp_path, name) / inside
-    text, count = re.subn(old, new, path.read_text(), count=0 if name == "easymocap" else 1)
+    text, count = re.subn(old, new, path.read_text(), count=1)
     path.write_text(text)
     assert count
     with pytest.raises(InputError, match=said):
         read_any(path)
 
 
+def test_cameras_of_which_intri_knows_nothing_are_told(tmp_path: Path) -> None:
+    left, *others = (without_shear(camera) for camera in benchmark_cameras())
+    write_as(tmp_path / "all", Rig(cameras=(left, *others)), "easymocap")
+    write_as(tmp_path / "two", Rig(cameras=tuple(others)), "easymocap")
+    (tmp_path / "two" / "extri.yml").write_bytes((tmp_path / "all" / "extri.yml").read_bytes())
+    assert notes_of(read_any(tmp_path / "two")) == ["Left out, because intri.yml does not name them: L."]
+
+
+def test_a_matrix_that_openptv_does_not_read_is_not_read(tmp_path: Path) -> None:
+    write_as(tmp_path, rig := Rig(cameras=tuple(without_shear(camera) for camera in benchmark_cameras())), "openptv")
+    lines = (tmp_path / "L.ori").read_text().splitlines()
+    (tmp_path / "L.ori").write_text("\n".join([*lines[:3], "1 0 0", "0 1 0", "0 0 1", *lines[6:]]))
+    assert np.abs(read_any(tmp_path)["L"].R_cam_world - rig["L"].R_cam_world).max() < 1e-3
+
+
 @pytest.mark.parametrize(("name", "file"), [("opencv", "rig"), ("agisoft", "rig.yml"), ("anipose", "rig.xml")])
-def test_a_name_by_which_the_format_is_not_found_again_is_refused(name: str, file: str, tmp_path: Path) -> None:
+def test_a_name_by_which_the_format_is_not_found_again_is_refused(
+    name: str, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(InputError, match=f"{file} is no name of a file of {name}; let it end in"):
         write_as(tmp_path / file, Rig(cameras=benchmark_cameras()), name)
     assert not list(tmp_path.iterdir())
+    (tmp_path / "bar").mkdir()  # refused before anything is measured
+    command = ["calibrate", str(tmp_path / "bar"), "--bar-length", "0.5", "--export", name, "--out", str(tmp_path / file), "--quiet"]
+    assert main(command) == 2 and f"is no name of a file of {name}" in capsys.readouterr().err
 
 
 ORI = """  101.6620   -54.7000   -70.0000
@@ -396,7 +415,6 @@ def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_converts(tmp_path: Path) -> None:
-    from tricap.core.cli.main import main
 
     write_as(tmp_path / "cameras.xml", Rig(cameras=benchmark_cameras()), "agisoft")
     assert main(["calibrate", "--import", str(tmp_path / "cameras.xml"), "--out", str(tmp_path / "rig.toml"), "--quiet"]) == 0
