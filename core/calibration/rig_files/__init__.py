@@ -24,16 +24,6 @@ FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "openptv": openptv.write,
     "pose2sim": toml_files.write_pose2sim,
 }
-READERS: dict[str, Callable[[Path], Rig]] = {
-    "agisoft": agisoft.read,
-    "anipose": toml_files.read,
-    "caliscope": toml_files.read,
-    "colmap": colmap.read,
-    "easymocap": opencv_files.read_easymocap,
-    "opencv": opencv_files.read,
-    "openptv": openptv.read,
-    "pose2sim": toml_files.read,
-}
 WITH_FISHEYE = ("anipose", "pose2sim", "caliscope")  # that can hold OpenCV's fisheye lens
 ENDINGS = {  # of the formats of one file, by which it is read again
     "agisoft": (".xml",),
@@ -42,7 +32,7 @@ ENDINGS = {  # of the formats of one file, by which it is read again
     "opencv": (".yml", ".yaml", ".xml"),
     "pose2sim": (".toml",),
 }
-NOTED_PX = 0.1  # between a camera and what a format makes of it: from here it is told
+NOTED_PX = 0.1  # from this difference on between a camera and the one in an exported file, there is a note
 FOLDERS = {  # formats of several files in a folder, and their names
     "colmap": ("cameras.txt", "images.txt", "points3D.txt"),
     "easymocap": ("intri.yml", "extri.yml"),
@@ -122,19 +112,19 @@ def notes_of(rig: Rig) -> list[str]:
 
 def lens_note(path: Path, rig: Rig, name: str) -> str:
     """Which camera in a file of `write_as` differs most from the rig's, because the format lacks terms of its lens: a sentence, or ""."""
-    again = READERS[name](Path(path)).cameras
+    again = read_any(path).cameras
     named = {camera.name: camera for camera in again}
     pairs = [(camera, named.get(camera.name, other)) for camera, other in zip(rig.cameras, again)]
-    off_px, worst = max((_apart_px(camera, other), camera.name) for camera, other in pairs)
-    if off_px < NOTED_PX:
+    difference_px, worst = max((_largest_difference_px(camera, other), camera.name) for camera, other in pairs)
+    if difference_px < NOTED_PX:
         return ""
     return (
-        f"Camera {worst} in {path} differs by up to {off_px:.1f} px from the calibrated one, because {name} lacks terms of its lens; "
+        f"Camera {worst} in {path} differs by up to {difference_px:.1f} px from the calibrated one, for {name} lacks terms of its lens; "
         "where that matters, choose another format."
     )
 
 
-def _apart_px(camera: Camera, other: Camera) -> float:
+def _largest_difference_px(camera: Camera, other: Camera) -> float:
     """The largest distance between pixels of a camera and where another one sees the same directions; inf where it sees some nowhere."""
     xy = grid_of(camera)
     directions = camera.directions(xy) @ camera.R_cam_world
