@@ -11,7 +11,7 @@ import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ...core.calibration.boards.board import Board, BoardKind, Lens, write_board
-from ...core.calibration.rig_files import FORMATS, lens_note, notes_of, read_any, write_as
+from ...core.calibration.rig_files import FORMATS, lens_note, read_any, write_as
 from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
@@ -280,7 +280,7 @@ class ImportRig(TellingOperator, ImportHelper, bpy.types.Operator):
         """Read the file and build its cameras."""
         rig = read_any(folders.absolute(self.filepath))
         build_cameras(context.scene, rig, {}, {})
-        return " ".join([f"{len(rig.cameras)} cameras from {self.filepath}.", *notes_of(rig)])
+        return " ".join([f"{len(rig.cameras)} cameras from {self.filepath}.", *rig.remarks])
 
 
 class ExportRig(TellingOperator, ExportHelper, bpy.types.Operator):

@@ -13,7 +13,7 @@ from ..calibration.boards.board import Board, BoardKind, Lens, write_board
 from ..calibration.boards.footage import measure_boards
 from ..calibration.boards.observations import BoardObservations
 from ..calibration.calibrate import Start, Starts, calibrate_rig, check_report, measure_bar, open_bar, open_boards, write_report
-from ..calibration.rig_files import FOLDERS, check_place, lens_note, notes_of, read_any, write_as
+from ..calibration.rig_files import FOLDERS, check_place, lens_note, read_any, write_as
 from ..calibration.together import BarAndBoard, check_names
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
@@ -128,8 +128,7 @@ def _convert(args: argparse.Namespace) -> list[str]:
     lines = [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
     if "scale" in rig.metadata:
         lines.append(f"The scale of {args.source}: {rig.metadata['scale']}.")
-    lines += notes_of(rig)
-    return [*lines, *_lens_notes(args, rig)]
+    return [*lines, *rig.remarks, *_lens_notes(args, rig)]
 
 
 def _lens_notes(args: argparse.Namespace, rig: Rig) -> list[str]:
@@ -168,7 +167,9 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
         if isinstance(result.calibration.observations, BarObservations):
             written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
-        return [json.dumps(report.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
+        figures = report.figures(result.calibration, result.quality, result.verdict)
+        figures["remarks"] += _lens_notes(args, result.rig)
+        return [json.dumps(figures, indent=1, ensure_ascii=False)]
     remarks = [f"{line[0].upper()}{line[1:]}." for line in result.calibration.remarks]
     return [
         *args.started,

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, check_cameras
@@ -102,12 +101,6 @@ def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
     written = FORMATS[name](Path(path), rig)
     list_files(Path(path), FOLDERS[name], [file.name for file in written])
     return written
-
-
-def notes_of(rig: Rig) -> list[str]:
-    """What a reader decided about a rig, in sentences: cameras that it left out, sizes that the file lacks."""
-    notes = rig.metadata.get("notes", [])
-    return [note for note in notes if isinstance(note, str) and bounded.is_plain(note)] if isinstance(notes, list) else []
 
 
 def lens_note(path: Path, rig: Rig, name: str) -> str:

@@ -16,7 +16,7 @@ from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera, camera_of, interior_of
 from ...geometry.rig import Rig
-from .reading import NO_UNIT, make_camera, noted, numbers, text_of
+from .reading import NO_UNIT, left_out, make_camera, numbers, text_of
 
 
 def read(path: Path) -> Rig:
@@ -32,11 +32,11 @@ def read(path: Path) -> Rig:
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
     scaled = root.findtext(".//chunk/transform/scale")
     scale = float(numbers((scaled or "1").split(), (1,), f"The chunk's scale in {path}")[0])
-    cameras, left_out = [], list[str]()
+    cameras, unaligned = [], list[str]()
     for element in root.iter("camera"):
         transform = element.findtext("transform")
         if transform is None:
-            left_out.append(str(element.get("label") or element.get("id")))
+            unaligned.append(str(element.get("label") or element.get("id")))
             continue
         sensor = sensors.get(element.get("sensor_id"))
         if sensor is None:
@@ -44,8 +44,8 @@ def read(path: Path) -> Rig:
         cameras.append(_camera(path, str(element.get("label") or element.get("id")), sensor, transform, scale))
     if not cameras:
         raise InputError(f"{path} has no aligned camera; align the cameras in Metashape and export them as Agisoft XML.")
-    notes = noted(left_out, "they are not aligned in Metashape")
-    return Rig(cameras=tuple(cameras), metadata=notes if scaled else {"scale": NO_UNIT, **notes})
+    remarks = left_out(unaligned, "they are not aligned in Metashape")
+    return Rig(cameras=tuple(cameras), metadata={} if scaled else {"scale": NO_UNIT}, remarks=remarks)
 
 
 def _camera(path: Path, name: str, sensor: Xml.Element, transform: str, scale: float) -> Camera:

@@ -23,7 +23,7 @@ MODELS = {
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
 
-LEAST_QUATERNION = 0.1  # its length is 1
+QUATERNION = 0.01  # its length is 1 ±
 
 
 def read(path: Path) -> Rig:
@@ -35,17 +35,15 @@ def read(path: Path) -> Rig:
     from scipy.spatial.transform import Rotation
 
     folder = path if path.is_dir() else path.parent
-    interior = {}
-    for line in _lines(folder / "cameras.txt"):
-        interior[line[0]] = _interior(line, folder)
+    lenses = {line[0]: line for line in _lines(folder / "cameras.txt")}  # of a large model many more than the images here
     cameras, names = [], list[Path]()
     for line in _image_lines(folder / "images.txt"):
         values = numbers(line[1:8], (7,), f"Image {line[0]} in {folder / 'images.txt'}")
-        if line[8] not in interior:
+        if line[8] not in lenses:
             raise InputError(f"Image {line[0]} in {folder / 'images.txt'} names camera {line[8]}, which cameras.txt lacks.")
-        size, matrix, distortions = interior[line[8]]
-        if np.linalg.norm(values[:4]) < LEAST_QUATERNION:
-            raise InputError(f"Image {line[0]} in {folder / 'images.txt'} has no rotation: its quaternion is zero.")
+        size, matrix, distortions = _interior(lenses[line[8]], folder)
+        if abs((length := np.linalg.norm(values[:4])) - 1) > QUATERNION:
+            raise InputError(f"Image {line[0]} in {folder / 'images.txt'} has no rotation: its quaternion is {length:.3g} long, not 1.")
         R = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
         image = Path(" ".join(line[9:]))
         names.append(image.parent / image.stem)
@@ -58,13 +56,15 @@ def read(path: Path) -> Rig:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    return _split([line for line in text_of(path).splitlines() if line.strip() and not line.startswith("#")], path)
+    return [line.split() for line in text_of(path).splitlines() if line.strip() and not line.startswith("#")]
 
 
 def _image_lines(path: Path) -> list[list[str]]:
     """Every other line: the second of an image holds its points and may be empty."""
     lines = [line for line in text_of(path).splitlines() if not line.startswith("#")]
-    found = _split([line for line in lines[0::2] if line.strip()], path)
+    found = [line.split() for line in lines[0::2] if line.strip()]
+    if len(found) > MOST_CAMERAS:
+        raise InputError(f"{path} has {len(found)} images; a rig has at most {MOST_CAMERAS} cameras. Leave out those that are not used.")
     if any(len(line) < 10 for line in found) or not all(map(_are_points, lines[1::2])):
         raise InputError(f"{path} is damaged: an image needs ten entries, and a second line, of three numbers a point or empty.")
     return found
@@ -74,12 +74,6 @@ def _are_points(line: str) -> bool:
     """Whether a line has x, y and the number of a point for each point, and no name of an image."""
     words = line.split()
     return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
-
-
-def _split(lines: list[str], path: Path) -> list[list[str]]:
-    if len(lines) > MOST_CAMERAS:
-        raise InputError(f"{path} has {len(lines)} cameras; a rig has at most {MOST_CAMERAS}. Leave out those that are not used.")
-    return [line.split() for line in lines]
 
 
 def _interior(line: list[str], folder: Path) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:

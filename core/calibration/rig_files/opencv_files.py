@@ -24,7 +24,7 @@ from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, noted, numbers, plain, text_of
+from .reading import five, left_out, make_camera, numbers, plain, text_of
 
 NAMES = re.compile(r'"([^"]*)"|([^\s",]+)')
 STEREO_SIZE = ("image_width", "width"), ("image_height", "height")
@@ -147,23 +147,24 @@ def read(path: Path) -> Rig:
         return read_easymocap(path)
     if names:
         cameras = tuple(_of_rig(nodes, name) for name in names)
-        return _rig(cameras, [nodes.number(f"image_{side}_{name}") for name in names for side in ("width", "height")])
+        return _rig(cameras, [[nodes.number(f"image_{side}_{name}") for side in ("width", "height")] for name in names])
     if nodes.has("M1") and nodes.has("M2"):
-        return _rig(_stereo(path, nodes), [nodes.number(*words) for words in STEREO_SIZE])
+        return _rig(_stereo(path, nodes), [[nodes.number(*words) for words in STEREO_SIZE]] * 2)
     K = nodes.matrix("camera_matrix" if nodes.has("camera_matrix") else "K", (3, 3))
     D = nodes.matrix("distortion_coefficients" if nodes.has("distortion_coefficients") else "D", (-1,))
     sides = [nodes.number("image_width", "image_Width"), nodes.number("image_height", "image_Height")]
     camera = make_camera(path.stem, _size(K, *sides), K, five(D, f"The distortion in {path}"), np.eye(3), np.zeros(3))
-    return _rig((camera,), sides)
+    return _rig((camera,), [sides])
 
 
-def _rig(cameras: tuple[Camera, ...], sides: Sequence[float | None]) -> Rig:
-    """The rig, with a note if a file lacks `sides` of images."""
-    if all(sides):
+def _rig(cameras: tuple[Camera, ...], sizes_px: Sequence[Sequence[float | None]]) -> Rig:
+    """The rig, with a remark on the cameras of which a file lacks the width or height of the images."""
+    without = [camera for camera, size in zip(cameras, sizes_px) if not all(size)]
+    if not without:
         return Rig(cameras=cameras)
-    sizes = ", ".join(f"{camera.name} {camera.size_px[0]}×{camera.size_px[1]}" for camera in cameras)
-    note = f"The file lacks the images' sizes, so they were derived from the principal points ({sizes}); compare with the footage."
-    return Rig(cameras=cameras, metadata={"notes": [note]})
+    sizes = ", ".join(f"{camera.name} {camera.size_px[0]}×{camera.size_px[1]}" for camera in without)
+    remark = f"The file lacks these sizes of images, so they were derived from the principal points ({sizes}); compare with the footage."
+    return Rig(cameras=cameras, remarks=(remark,))
 
 
 def _size(K: np.ndarray, width: float | None, height: float | None) -> tuple[float, float]:
@@ -229,9 +230,9 @@ def read_easymocap(path: Path) -> Rig:
         cameras.append(make_camera(name, size, K, five(D, f"The distortion of {name}"), R, outer.matrix(f"T_{name}", (3,))))
     if not cameras:
         raise InputError(f"{folder / 'intri.yml'} names no cameras; it needs the list “names”.")
-    rig = _rig(tuple(cameras), [inner.number(f"{side}_{name}") for name in inner.names() for side in "WH"])
-    surplus = noted([name for name in outer.names() if name not in inner.names()], "intri.yml does not name them")
-    return replace(rig, metadata={"notes": [*rig.metadata.get("notes", []), *surplus["notes"]]}) if surplus else rig
+    rig = _rig(tuple(cameras), [[inner.number(f"{side}_{name}") for side in "WH"] for name in inner.names()])
+    surplus = [name for name in outer.names() if name not in inner.names()]
+    return replace(rig, remarks=rig.remarks + left_out(surplus, "intri.yml does not name them"))
 
 
 def write_easymocap(folder: Path, rig: Rig) -> list[Path]:

@@ -20,6 +20,7 @@ from ...geometry.rig import LARGEST_NUMBER
 from ...geometry.rotation import rotation_from_vector
 
 LARGEST_PX = 100_000
+NAMED = 20  # cameras in a remark
 NO_UNIT = "the file has no unit, so its lengths were taken as metres"
 
 
@@ -38,9 +39,9 @@ def text_of(path: Path) -> str:
     return text
 
 
-def noted(cameras: Sequence[str], why: str) -> dict[str, list[str]]:
-    """The entry `notes` of a rig's metadata that names cameras of a file that were left out; empty if none was."""
-    return {"notes": [f"Left out, because {why}: {', '.join(cameras)}."]} if cameras else {}
+def left_out(cameras: Sequence[str], why: str) -> tuple[str, ...]:
+    """The remark on a rig that names cameras of a file that were left out; none if none was."""
+    return (f"Left out, because {why}: {', '.join(cameras[:NAMED])}{' …' if len(cameras) > NAMED else ''}.",) if cameras else ()
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

@@ -16,7 +16,7 @@ from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, sigmas_of
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, noted, numbers, plain, text_of
+from .reading import five, left_out, make_camera, numbers, plain, text_of
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
@@ -43,11 +43,12 @@ def read(path: Path) -> Rig:
     if not cameras:
         raise InputError(f"{path} has no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
     sigmas = {cameras[k].name: sigmas_of(e["sigma"], cameras[k].name, path) for k, e in finished.items() if "sigma" in e}
-    notes = noted([str(entries[key].get("name", key)) for key in ignored], "they are marked `ignore`")
+    remarks = left_out([str(entries[key].get("name", key)) for key in ignored], "they are marked `ignore`")
     if rounded := [cameras[key].name for key in finished if any(side != round(side) for side in finished[key]["size"])]:
-        said = f"The file has sizes that are no whole pixels, which were rounded ({', '.join(rounded)}); compare with the footage."
-        notes["notes"] = [*notes.get("notes", []), said]
-    return Rig(cameras=tuple(cameras.values()), metadata=(metadata if isinstance(metadata, dict) else {}) | notes, sigmas=sigmas)
+        remarks += (f"The file has sizes that are no whole pixels, which were rounded ({', '.join(rounded)}); compare with the footage.",)
+    if turned := [cameras[key].name for key in finished if finished[key].get("rotation_count")]:
+        remarks += (f"Calibrated on pictures that were turned (`rotation_count` of {', '.join(turned)}); turn the footage likewise.",)
+    return Rig(cameras=tuple(cameras.values()), metadata=metadata if isinstance(metadata, dict) else {}, sigmas=sigmas, remarks=remarks)
 
 
 def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camera:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, notes_of, read_any, write_as
+from tricap.core.calibration.rig_files import FOLDERS, FORMATS, lens_note, read_any, write_as
 from tricap.core.calibration.rig_files.openptv import image
 from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
@@ -227,10 +227,12 @@ def test_colmap_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("changed", "said"), [
-    (("images.txt", "1 0.851773 0.0165051 0.503764 -0.142941", "1 0 0 0 0"), "Image 1 in .* has no rotation: its quaternion is zero"),
+    (("images.txt", "1 0.851773 0.0165051 0.503764 -0.142941", "1 0 0 0 0"), "no rotation: its quaternion is 0 long, not 1"),
     (("images.txt", "L.png\n\n", "L x y.png\n"), "an image needs ten entries, and a second line, of three numbers a point or empty"),
     (("cameras.txt", "1152 -0.02", "1152 -0.02 1 2"), "Camera 1 in .* must be 6 numbers"),
-    (("cameras.txt", "1 SIMPLE_RADIAL", "\n".join(["1 PINHOLE 8 8 1 1 1 1"] * 201)), "cameras.txt has 201 cameras; a rig has at most 200"),
+    (("images.txt", "1 0.851773", "\n\n".join(["3 0.851773 0.0165051 0.503764 -0.142941 0 0 0 1 C.png"] * 200) + "\n\n1 0.851773"),
+     "images.txt has 202 images; a rig has at most 200 cameras"),
+    (("images.txt", "1 0.851773", "1 0.951773"), "its quaternion is 1.09 long, not 1"),
 ])  # fmt: skip
 def test_colmap_files_that_contradict_themselves(tmp_path: Path, changed: tuple[str, str, str], said: str) -> None:
     """A zero quaternion ended in a traceback; a file without the lines of points lost every other camera."""
@@ -250,7 +252,8 @@ def test_colmap_files_that_contradict_themselves(tmp_path: Path, changed: tuple[
     ("agisoft", "<transform>", "<other>", "Left out, because they are not aligned in Metashape: L."),
     ("caliscope", "rotation_count = 0", "ignore = true", "Left out, because they are marked `ignore`: L."),
     ("anipose", "size = [768, ", "size = [768.4, ", "The file has sizes that are no whole pixels, which were rounded (L)"),
-    ("easymocap", "W_L:", "w_L:", "The file lacks the images' sizes, so they were derived from the principal points"),
+    ("easymocap", "W_L:", "w_L:", "The file lacks these sizes of images, so they were derived from the principal points (L 783×576);"),
+    ("caliscope", "rotation_count = 0", "rotation_count = 1", "Calibrated on pictures that were turned (`rotation_count` of L)"),
 ])  # fmt: skip
 def test_what_is_left_out_or_taken_for_granted_is_told(name: str, old: str, new: str, note: str, tmp_path: Path) -> None:
     write_as(target(tmp_path, name), Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras())), name)
@@ -258,9 +261,9 @@ def test_what_is_left_out_or_taken_for_granted_is_told(name: str, old: str, new:
     first, found, rest = path.read_text().partition(old)
     if name == "agisoft":
         rest = rest.replace("</transform>", "</other>", 1)
-    assert found and not notes_of(read_any(path))
+    assert found and not read_any(path).remarks
     path.write_text(first + new + rest)
-    (said,) = notes_of(read_any(path))
+    (said,) = read_any(path).remarks
     assert said.startswith(note)
 
 
@@ -283,7 +286,7 @@ def test_cameras_of_which_intri_knows_nothing_are_told(tmp_path: Path) -> None:
     write_as(tmp_path / "all", Rig(cameras=(left, *others)), "easymocap")
     write_as(tmp_path / "two", Rig(cameras=tuple(others)), "easymocap")
     (tmp_path / "two" / "extri.yml").write_bytes((tmp_path / "all" / "extri.yml").read_bytes())
-    assert notes_of(read_any(tmp_path / "two")) == ["Left out, because intri.yml does not name them: L."]
+    assert read_any(tmp_path / "two").remarks == ("Left out, because intri.yml does not name them: L.",)
 
 
 def test_a_matrix_that_openptv_does_not_read_is_not_read(tmp_path: Path) -> None:
