@@ -8,18 +8,20 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..take.footage import Footage
 from ..take.person_masks import check_mask, silhouette_files, silhouettes
-from ..take.sources import read_picture
-from .findings import Cause, Finding, wrong
+from ..take.sources import KeypointSource, read_picture
+from .findings import Cause, Finding, doubtful, wrong
 from .survey import LONGEST
+
+MORE_FRAMES = 1.5  # times the images of a view: keypoints of so many are of another recording or rate
 
 
 def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -> list[Finding]:
     """Every file and value that the stages of a run read besides the images: one finding for each of the first faults of a kind."""
     checks: list[Callable[[], object]] = [lambda: check_body(footage, fitting)]
-    checks += [lambda source=source: read_source(footage, source) for source in footage.take.keypoints]  # type: ignore[misc]
     checks += [lambda k=k: _check_silhouettes(footage, k, monitor) for k in range(len(footage.take.views))]  # type: ignore[misc]
     checks.append(lambda: _silhouettes_of_first(footage))
     findings = list[Finding]()
+    checks += [lambda source=source: findings.extend(_keypoint_doubts(footage, source)) for source in footage.take.keypoints]  # type: ignore[misc]
     for check in checks:
         monitor.check()
         try:
@@ -28,6 +30,21 @@ def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -
             if str(error) not in [finding.sentence for finding in findings]:
                 findings.append(wrong(Cause.INPUT, str(error)))
     return findings
+
+
+def _keypoint_doubts(footage: Footage, source: KeypointSource) -> list[Finding]:
+    """A doubt where the keypoints of a view have far more frames than it has images.
+
+    Raises:
+        InputError: they cannot be used.
+    """
+    last = int(read_source(footage, source).frame.max())
+    sequences = [s for view, s in zip(footage.take.views, footage.sequences) if source.view in ("", view.name)]
+    images = max(len(sequence.files()) if len(sequence.files()) > 1 else sequence.count for sequence in sequences)
+    if last < MORE_FRAMES * images or footage.take.frames is not None and images == len(footage.frames):
+        return []
+    sentence = f"The keypoints “{source.files}” go on to frame {last}, where the footage has {images} images."
+    return [doubtful(Cause.FRAME_RATE, sentence, "Are they of the same recording, at the same number of images per second?")]
 
 
 def _silhouettes_of_first(footage: Footage) -> None:

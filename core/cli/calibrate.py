@@ -20,11 +20,14 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import Rig, read_rig, write_rig
 from ..images.interlace import BOTH
-from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence
+from ..images.sequence import MOVIE_ENDINGS, ImageSequence, movie_rate
 from ..results.outputs import check_output, check_replaceable
 from ..take.bar_file import STARTS, bar_path, write_bar
 from ..tracking.point_tables import read_points
 from .arguments import DICTIONARY, check_not_read, refuse_unused
+
+RIG = ".toml"  # of a rig of our own: by its ending it is read again
+SAME_RATE = 0.0005  # relative difference of films' rates: an image in half a minute
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -40,8 +43,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError("Give either the folder of the images of the bar or board, or --import with another tool's calibration.")
     if args.out is None:
         raise InputError("Give --out with the rig to write, such as --out rig.toml.")
-    if not args.format and args.out.suffix.lower() in IMAGE_ENDINGS + MOVIE_ENDINGS:
-        raise InputError(f"--out {args.out} is named like an image or a movie; give the file of the rig to write, such as rig.toml.")
+    if not args.format and args.out.suffix.lower() != RIG and not args.out.is_dir():
+        raise InputError(
+            f"--out {args.out} is no name of a rig, which ends in {RIG}; choose such a name, or another tool's format with --export."
+        )
     return _convert(args) if args.source is not None else _calibrate(args, board, monitor)
 
 
@@ -201,7 +206,23 @@ def _starts(args: argparse.Namespace, monitor: Monitor, folder: Path) -> Starts 
     """Finds what belongs together in the films of a folder; None where images of the same number do."""
     if args.synchronise is not None and args.rates is not None:
         raise InputError("Give the rates with --synchronise, such as --synchronise L=24,C=30,R=60, or with --rates, not with both.")
-    return None if args.synchronise is None and args.rates is None else partial(_start, args, monitor, folder)
+    if args.synchronise is None and args.rates is None:
+        args.started = [*args.started, *_other_rates(folder)]
+        return None
+    return partial(_start, args, monitor, folder)
+
+
+def _other_rates(folder: Path) -> list[str]:
+    """A sentence where the films in a folder state different rates, and their images are taken to belong together one by one."""
+    films = sorted(path for path in folder.iterdir() if path.suffix.lower() in MOVIE_ENDINGS) if folder.is_dir() else []
+    rates = {path.stem: movie_rate(path) for path in films}
+    if not rates or max(rates.values()) <= (1 + SAME_RATE) * min(rates.values()):
+        return []
+    stated = ", ".join(f"{name} {rate:.5g}" for name, rate in rates.items())
+    return [
+        f"The films in {folder} state different rates ({stated} images per second), but are taken image by image. If these are true, give "
+        f"--rates {','.join(f'{name}={rate:.5g}' for name, rate in rates.items())}, or --synchronise with them."
+    ]
 
 
 def _start(args: argparse.Namespace, monitor: Monitor, folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> Start:

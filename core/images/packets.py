@@ -23,6 +23,7 @@ H264 = ("avc1", "avc3", "h264", "H264", "x264", "X264", "\x1b\0\0\0")
 HEVC = ("hvc1", "hev1", "hevc", "HEVC", "H265", "\x24\0\0\0")
 FIELDS = ("dvsd", "dvcp", "dvh1", "mpg2", "mp2v", "\x02\0\0\0")  # DV and MPEG-2, which mark nearly all pictures as interlaced
 MOST_HEADER = 4096  # bytes of a sequence header that are looked at
+CLEARLY_MORE = 8  # pictures beyond those of the header: a few may be stored twice, or be empty
 REORDERED = 16  # packets by which a codec may store a picture before those that are shown earlier
 
 
@@ -54,6 +55,11 @@ class Packets:
         self._read(count - 1 + REORDERED)
         stamps = np.sort(self._stamps_ms)[:count]
         return stamps if (np.diff(stamps) > 0).all() else np.zeros(0)
+
+    def exceed(self, count: int) -> bool:
+        """Whether clearly more than so many pictures are stored."""
+        self._read(count + CLEARLY_MORE)
+        return self._next > count + CLEARLY_MORE
 
     def _read(self, frame: int) -> None:
         while self._next <= frame and self._capture.isOpened():

@@ -37,6 +37,11 @@ MARKED = (
     "{path} is marked as interlaced, and such movies cannot be decoded here; take the mark away, which keeps its fields as they are: "
     "ffmpeg -i {name} -vf setfield=prog -c:v ffv1 new.mkv"
 )
+AVI = ".avi"  # whose header has the number of images, written at the end of a recording
+CUT = (
+    "The header of {path} has {count} images, but more follow, as after a recording that did not end properly; "
+    "write it anew: ffmpeg -i {name} -c copy new.mkv"
+)
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
 
 
@@ -208,6 +213,8 @@ class Movie:
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
         self._refuse_change(index)
+        if index == self._count - 1 and self._path.suffix.lower() == AVI and self._packets.exceed(self._count):
+            raise InputError(CUT.format(path=self._path, count=self._count, name=shlex.quote(self._path.name)))
         if self._packets.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
             raise InputError(MARKED.format(path=self._path, name=shlex.quote(self._path.name)))
         self._last = image

@@ -22,6 +22,8 @@ SPEED_M_S = 2.0  # m/s in depth, of a walking person
 MARGIN_M = 0.30  # m that a person may move in depth between frames, and by which a limb may exceed the cloud of the frame before
 FURTHEST_LIMB_M = 1.2  # m in front of the middle of a person's depths
 CLOUD_PERCENT = (1, 99)  # percentiles of a cloud's depths that are taken as its limits
+GROUP_CELL_M, GROUP_CELLS = 0.2, 2  # cubes, of which points in one and in the second next to it belong together
+GROUP = 6  # points; smaller groups do not show where the person is
 MIN_CLOUD = 20  # points of a cloud; fewer do not change the depths
 CLUSTER_WIDTH = 0.12  # of log depth
 CLUSTER_SHARE = 0.3  # of the seeds in the richest cluster
@@ -134,6 +136,19 @@ def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, c
         near, latest = max(near, middle - FURTHEST_LIMB_M), middle + 2 * MARGIN_M
     far = min(high + MARGIN_M, max(near + width, latest))
     return Foreground(depth_range_m=(near, far), method="frame before", planes=before.planes)
+
+
+def gathered(xyz_m: np.ndarray) -> np.ndarray:
+    """Points (N, 3) without small groups apart from the others: a place of the background can be matched falsely in every frame."""
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(xyz_m):
+        return xyz_m
+    cells, cell, count = np.unique(np.floor(xyz_m / GROUP_CELL_M), axis=0, return_inverse=True, return_counts=True)
+    joined = np.abs(cells[:, None] - cells).max(axis=2) <= GROUP_CELLS
+    group = connected_components(joined, directed=False)[1]
+    large = np.bincount(group, count) >= GROUP
+    return xyz_m[large[group][cell.ravel()]] if large.any() else xyz_m
 
 
 def _neighbours(position: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ MADE_BY = {  # what of them the stages write, and others need
     "report": ("report/report.html",),
 }
 
+MOST_ROW = 1 << 16  # bytes of a row of a table
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
 PARENTS = ("cache", FIELDS)  # whose folders are written to
 WRITTEN = (
@@ -217,13 +218,14 @@ class FitCheckpoints:
 
 def lost(folder: Path, run: Mapping[str, Any], among: Iterable[str] | None = None) -> dict[str, list[str]]:
     """By stage, the results in a folder, all of them or those `among` some, that have fewer files or bytes than when run.json was written,
-    or arrays (.npz) with another content. The run.json of earlier versions has no sizes to compare."""
-    then, found = run.get("files", {}), dict[str, list[str]]()
+    or arrays (.npz) with another content. The run.json of earlier versions has no sizes to compare.
+
+    A table that somebody edited may have fewer bytes, if it still ends with a row of the last frame."""
+    then, found, last = run.get("files", {}), dict[str, list[str]](), run.get("frames", [0, 0])[1] - 1
     for stage, names in MADE_BY.items():
         known = [name for name in names if name in then and (among is None or name in among)]
-        less = [
-            name for name in known if any(now < was for now, was in zip(_size(folder / name), then[name])) or _is_damaged(folder / name)
-        ]
+        smaller = [name for name in known if any(now < was for now, was in zip(_size(folder / name), then[name]))]
+        less = [name for name in known if (name in smaller and not _ends_with(folder / name, last)) or _is_damaged(folder / name)]
         if less:
             found[stage] = less
     return found
@@ -249,6 +251,19 @@ def _size(path: Path) -> tuple[int, int]:
     """The number of files that a result has, and their bytes."""
     sizes = [p.stat().st_size for p in _files(path)]
     return len(sizes), sum(sizes)
+
+
+def _ends_with(path: Path, frame: int) -> bool:
+    """Whether a file is a table whose last row is whole, and of this frame."""
+    if path.suffix != ".csv":
+        return False
+    try:
+        with bounded.opened(path, bounded.TABLE_BYTES) as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - MOST_ROW))
+            *_, row, rest = [b"", *file.read().replace(b"\r", b"").split(b"\n")]
+    except OSError:
+        return False
+    return not rest and row.startswith(f"{frame},".encode())
 
 
 def _is_damaged(path: Path) -> bool:

@@ -12,7 +12,7 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
@@ -186,6 +186,7 @@ def open_run(
         outlines, notes = _outlines(results, before, footage, digests, check=not for_contours)
         with _with_errors(notes):
             keys = _known(results, before, stage_keys(footage, settings, Path(out)), by_content)
+            _check_not_lost(results.folder, before, footage, keys)
             kept = _kept_stages(results, before, keys, for_contours=for_contours, needs_body=needs_body)
             record, incomplete = new_record(footage, settings) | {drawn_outlines.ENTRY: outlines}, lost(results.folder, before)
             record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
@@ -212,6 +213,25 @@ def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> Non
             f"{folder} has results of the frames {first}:{end}, and an outline is tracked in the same ones; choose these frames, or "
             "another folder for the results."
         )
+
+
+def _check_not_lost(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
+    """Check that a finished body is not replaced by that of another take, or of some of its frames.
+
+    Raises:
+        InputError: it would be.
+    """
+    stages, now = before.get("stages", {}), footage.frames
+    if "fit" not in stages or "measure" in valid_stages(before, keys):
+        return
+    advice = "choose another folder for the results, or replace them with --restart."
+    take, text = before.get("take", ""), store.digest(footage.take.folder / "take.toml")
+    copied = Path(take).name == footage.take.folder.name or before.get("inputs", {}).get("take.toml") == text
+    if bounded.is_plain(take) and not copied:
+        raise InputError(f"{folder} has the fitted body of another take, {take}; {advice}")
+    first, end = before.get("frames", (now.start, now.stop))
+    if first <= now.start and now.stop <= end and len(now) < end - first:
+        raise InputError(f"{folder} has the fitted body of the frames {first}:{end}; for {now.start}:{now.stop} alone {advice}")
 
 
 def _kept_stages(

@@ -31,7 +31,7 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import SurfaceSettings
 
-ALGORITHM = "surface 27"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 28"  # part of every key: raise it when the same input gives other numbers
 SEED_PX = 0.3  # precision of a seed in the images
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
@@ -123,7 +123,7 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
         where, seeds = _first_foreground(now, settings, monitor)
     else:
         confirmed = now.views.required_matches(settings.growing.pairs) > 1
-        depth = now.views.base.to_camera(before.person_m)[:, 2] if confirmed else _sure_depths(now.views, before)
+        depth = now.views.base.to_camera(fg.gathered(before.person_m))[:, 2] if confirmed else _sure_depths(now.views, before)
         where = fg.after(depth, before.where, MIN_SEEDS if before.field is None else fg.MIN_CLOUD, confirmed=confirmed)
         if before.field is None:
             seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))

@@ -41,6 +41,7 @@ JOINT_OF_ROLE = {
 }  # the roles that retargeting recognises in names
 LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # factors of the sigma, where detectors place the joint elsewhere
 LEAST_CONFIDENCE = 0.2  # of a detector's keypoint
+BEYOND = 0.1  # of the image's size: joints so far outside of it are possible
 
 
 def fit_input(
@@ -183,6 +184,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
         view = [v.name for v in footage.take.views].index(source.view)
         frames = footage.frames_of_images(view, points.number - source.offset_frames)
         found = _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+        _check_pixels(source, found.place, footage.sizes_px[view])
         return _check_frames(footage, source, found)
     if len(paths) > 1:
         raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")
@@ -190,6 +192,17 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
     frames = markers.frames - source.offset_frames
     found = _places(source, markers.names, frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
     return _check_frames(footage, source, found)
+
+
+def _check_pixels(source: KeypointSource, xy_px: np.ndarray, size_px: tuple[int, int]) -> None:
+    outside = ((xy_px < -BEYOND * np.array(size_px)) | (xy_px > (1 + BEYOND) * np.array(size_px))).any(axis=1)
+    where = (
+        "between 0 and 1" if (np.abs(xy_px) <= 1).all() else f"outside of its images of {size_px[0]}×{size_px[1]}" if outside.all() else ""
+    )
+    if where:
+        raise InputError(
+            f"All points of the keypoints “{source.files}” of view {source.view} lie {where}; give pixels of the images that the take has."
+        )
 
 
 def _check_frames(footage: Footage, source: KeypointSource, found: JointPlaces) -> JointPlaces:
@@ -212,7 +225,7 @@ def _markers(path: Path, axes: str | None) -> Markers:
 def _places(
     source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray, path: Path
 ) -> JointPlaces:
-    """The joints of a file, one row per place; the sigma of a point of confidence c is divided by √c."""
+    """The joints of a file, one row per place; the sigma of a point of confidence c is divided by √c, where c is at most 1."""
     for name in source.names:
         if name not in names:
             raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Correct `names` under [[keypoints]].")
@@ -223,6 +236,8 @@ def _places(
         for n, joint in enumerate(joints)
         if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()
     ]
+    if not rows and any(joints):
+        raise InputError(f"No point in {path} has a confidence of {LEAST_CONFIDENCE:g} or more; detect the joints again.")
     if not rows:
         raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of the body; map them under `names`.")
     t, n = np.array(rows).T
@@ -232,7 +247,7 @@ def _places(
         frame=frames[t],
         joint=tuple(joints[i] for i in n),
         place=places[t, n],
-        sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]),
+        sigma=source.sigma * loose[n] / np.sqrt(np.minimum(confidence[t, n], 1.0)),
     )
 
 

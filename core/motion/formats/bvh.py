@@ -267,7 +267,7 @@ def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "
         channels = ["Xposition Yposition Zposition"] if moves else []
         lines.extend(
             [
-                f"{pad}{'JOINT' if depth else 'ROOT'} {(names or {}).get(rig.names[b], rig.names[b]).replace(' ', '_')}",
+                f"{pad}{'JOINT' if depth else 'ROOT'} {_name((names or {}).get(rig.names[b], rig.names[b]))}",
                 f"{pad}{{",
                 f"{pad}\tOFFSET {_text(offset)}",
                 f"{pad}\tCHANNELS {6 if moves else 3} {' '.join([*channels, *(f'{axis}rotation' for axis in order)])}",
@@ -325,6 +325,11 @@ def _free_heads(motion: Motion) -> np.ndarray:
             rigid = motion.head_m[:, p] + motion.R[:, p] @ (rig.R_rest[p].T @ (rig.head_m[b] - rig.head_m[p]))
             free[b] = np.abs(motion.head_m[:, b] - rigid).max() > MOVED_M
     return free
+
+
+def _name(name: str) -> str:
+    """A name as one word of the file: without blanks, braces and what cannot be printed."""
+    return "".join("_" if c in " {}" or not c.isprintable() else c for c in name)
 
 
 def _text(vector: np.ndarray) -> str:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from tricap.core.calibration.calibrate import CalibratedRig, calibrate_rig
 from tricap.core.calibration.helmert import partial_network, positioned
 from tricap.core.calibration.precision import camera_covariance, predicted_error
 from tricap.core.calibration.together import BarAndBoard
+from tricap.core.cli.calibrate import _other_rates
 from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -190,10 +192,16 @@ def test_the_command_calibrates_with_both(tmp_path: Path, capsys: pytest.Capture
     assert "light" not in rig.metadata and truth.error_m(cameras, [rig[c.name] for c in cameras]) < 1e-3
     assert (tmp_path / "rig_bar.csv").exists() and "board" in (tmp_path / "report" / "calibration.json").read_text()
     assert main([*bar, *board, "--lenses-only"]) == 0 and "give the lenses only" in capsys.readouterr().out
+    for view, rate in (("L", 25.0), ("C", 30.0)):
+        film = cv2.VideoWriter(str(tmp_path / f"{view}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), rate, (64, 48))
+        film.write(np.zeros((48, 64, 3), np.uint8))
+        film.release()
+    (said,) = _other_rates(tmp_path)
+    assert "(C 30, L 25 images per second)" in said and "--rates C=30,L=25" in said and not _other_rates(tmp_path / "board")
     for arguments, message in (
         ([*bar, *board[:2]], "--with-board needs the board"),
         ([*bar, "--lenses-only"], "--lenses-only belongs to --with-board"),
         ([*bar[:2], *bar[4:], *board], "The bar's length is missing"),
-        ([*bar[:-1], str(tmp_path / "board" / "L" / "000.png"), *board], "is named like an image or a movie"),
+        ([*bar[:-1], str(tmp_path / "board" / "L" / "000.png"), *board], "is no name of a rig, which ends in .toml"),
     ):
         assert main(arguments) == 2 and message in capsys.readouterr().err

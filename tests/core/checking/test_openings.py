@@ -12,6 +12,7 @@ import pytest
 from tricap.core.checking.openings import opening_findings
 from tricap.core.cli import main
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline
@@ -125,6 +126,17 @@ def test_what_a_run_refuses_the_check_finds(plane_take: Path, tmp_path: Path, fa
     with pytest.raises(InputError) as refused:
         pipeline.run(take, tmp_path / "out", {"growing": {"spacing_px": 16}})
     assert said in str(refused.value)
+
+
+def test_keypoints_of_another_rate_are_doubtful(plane_take: Path, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    arm(take, CLICKS + '[[keypoints]]\nfiles = "kp/*.json"\nview = "C"\n')
+    person, images = [50.0, 60.0, 0.9] * 25, len([*(take / "C").iterdir()])
+    for frames, doubts in ((images, 0), (4 * images, 1)):
+        for i in range(frames):
+            store.write_json(take / "kp" / f"{i:04d}.json", {"people": [{"pose_keypoints_2d": person}]})
+        found = opening_findings(open_take(read_take(take)), FitSettings(), Monitor())
+        assert [f"the footage has {images} images" in f.sentence and not f.certain for f in found] == [True] * doubts
 
 
 def test_sound_masks_are_no_finding_and_settings_are_checked(plane_take: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,7 +25,7 @@ from tricap.core.take.take import JOINTS, FrameClicks
 def _footage(folder):
     views = tuple(SimpleNamespace(name=name, offset_frames=n, has_clock=False) for name, n in (("L", 0), ("C", 2)))
     take = SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout(), frames=(0, 12))
-    footage = SimpleNamespace(take=take, clocks=(), sequences=[SimpleNamespace(count=14)] * 2)
+    footage = SimpleNamespace(take=take, clocks=(), sequences=[SimpleNamespace(count=14)] * 2, sizes_px=[(768, 576)] * 2)
     footage.frames_of_images = partial(Footage.frames_of_images, footage)
     return footage
 
@@ -214,6 +214,27 @@ def test_every_layout_has_the_limbs() -> None:
 def test_bad_sources_are_refused(table, sentence) -> None:
     with pytest.raises(InputError, match=sentence):
         _source(**table)
+
+
+@pytest.mark.parametrize(("shift", "scale", "confidence", "sentence"), [
+    (5000, 1, 0.9, "of view C lie outside of its images of 768×576"),
+    (0, 1e-3, 0.9, "of view C lie between 0 and 1"),
+    (100, 1, 0.1, "No point in .* has a confidence of 0.2 or more"),
+])  # fmt: skip
+def test_keypoints_that_no_image_can_have_are_refused(tmp_path, shift: float, scale: float, confidence: float, sentence: str) -> None:
+    """They were taken, counted for nothing, and nobody was told."""
+    person = np.array(_person(shift, confidence)).reshape(-1, 3) * [scale, scale, 1]
+    _openpose(tmp_path / "kp", [person.ravel().tolist()], [person.ravel().tolist()])
+    with pytest.raises(InputError, match=sentence):
+        read_source(_footage(tmp_path), _source(files="kp/*.json", view="C"))
+
+
+def test_confidences_in_per_cent_make_nothing_more_certain(tmp_path) -> None:
+    found = []
+    for confidence in (1.0, 95.0):
+        _openpose(tmp_path / str(confidence), [_person(0, confidence)], [_person(0, confidence)])
+        found.append(read_source(_footage(tmp_path), _source(files=f"{confidence}/*.json", view="L", sigma=6.0)).sigma)
+    assert np.array_equal(*found)
 
 
 def test_bad_files_are_refused(tmp_path) -> None:

@@ -205,6 +205,22 @@ def movie_pictures(frames: int) -> list[np.ndarray]:
     return pictures
 
 
+def test_a_movie_whose_header_has_too_few_images_is_refused_at_its_end(tmp_path: Path) -> None:
+    """Of a recorder that crashed; of sixteen images thirteen were left out in silence."""
+    path = write_movie(tmp_path / "m.avi", 12)
+    whole = bytearray(path.read_bytes())
+    for chunk, at in ((b"avih", 8 + 16), (b"strh", 8 + 32)):  # dwTotalFrames and dwLength
+        place = whole.index(chunk) + at
+        assert int.from_bytes(whole[place : place + 4], "little") == 12
+        whole[place : place + 4] = (3).to_bytes(4, "little")
+    path.write_bytes(whole)
+    movie = Movie(path)
+    assert movie.count == 3 and movie.read(1).shape == (48, 64)
+    with pytest.raises(InputError, match="has 3 images, but more follow.*ffmpeg -i m.avi -c copy new.mkv"):
+        movie.read(2)
+    assert len(Movie(write_movie(tmp_path / "whole.avi", 12)).read(11)) == 48
+
+
 def test_a_movie_gives_the_frames_that_were_written_in_any_order(tmp_path: Path) -> None:
     path, pictures = write_movie(tmp_path / "m.avi", 7), movie_pictures(7)
     movie = open_sequence(tmp_path, images=None, movie="m.avi", view="L")

@@ -6,7 +6,7 @@ import numpy as np
 
 from tricap.core.images.interlace import row_grid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.foreground import MARGIN_M, Foreground, after
+from tricap.core.matching.foreground import MARGIN_M, Foreground, after, gathered
 from tricap.core.matching.seeds import at_an_end
 from tricap.core.matching.views import Views
 
@@ -51,3 +51,27 @@ def test_seeds_near_a_wall_do_not_show_where_the_person_is() -> None:
     xyz = np.array([[0.0, y, 1.0] for y in (-0.2, 0.0, 0.3, 1.05, 1.12, 1.18, 1.2)])
     assert wall.off_planes(xyz)[:, 1].tolist() == [-0.2, 0.0, 0.3, 1.05]
     assert len(Foreground(depth_range_m=(3.2, 4.4), method="everything").off_planes(xyz)) == len(xyz)
+
+
+def test_a_person_who_walks_away_is_followed_though_a_place_of_the_wall_is_always_matched_before_it() -> None:
+    """Three false seeds held the near end of the depths, and with it the far one: the person left them within a second."""
+    false, seeds = (
+        np.array([[1.3, 0.9, 2.62], [1.45, 0.92, 2.68], [1.3, 0.75, 2.66]]),
+        np.random.default_rng(3).normal(0, (0.2, 0.5, 0.1), (70, 3)),
+    )
+    for sift, followed_by in ((gathered, True), (lambda xyz: xyz, False)):
+        where = Foreground(depth_range_m=(2.4, 3.7), method="nearest surface")
+        for middle in np.arange(3.0, 4.5, 0.04):
+            seen = np.concatenate([seeds + [0, 0, middle], false])
+            near, far = where.depth_range_m
+            where = after(sift(seen[(seen[:, 2] > near) & (seen[:, 2] < far)])[:, 2], where)
+        assert (where.depth_range_m[1] > 4.5 + 0.15) == followed_by
+
+
+def test_parts_of_a_person_that_are_apart_are_kept() -> None:
+    random = np.random.default_rng(4)
+    feet, head, trunk = (random.normal(middle, 0.05, (n, 3)) for middle, n in (((0, 0.9, 3), 8), ((0, -0.8, 3), 6), ((0, 0, 3), 40)))
+    stray = np.array([[2.0, 0.0, 2.0], [-2.0, 0.0, 4.0]])
+    together = np.concatenate([feet, head, trunk])
+    assert np.array_equal(gathered(np.concatenate([together, stray])), together)
+    assert len(gathered(stray)) == 2 and len(gathered(np.zeros((0, 3)))) == 0, "without a group all stay"

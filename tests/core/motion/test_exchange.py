@@ -251,6 +251,15 @@ Frame Time: 0.04
 """
 
 
+def test_names_in_a_bvh_are_words(tmp_path: Path) -> None:
+    """Braces and line breaks in a name were structure of the file, escape sequences those of the terminal."""
+    motion = flail(person(), 3)
+    names = dict(zip(motion.rig.names, ("mixamorig:Hüfte 1", "a\n{\n}", "b\x1b[31m\u2028")))
+    write_bvh(tmp_path / "a.bvh", motion, names=names)
+    found = read_bvh(tmp_path / "a.bvh").rig.names
+    assert found[:3] == ("mixamorig:Hüfte_1", "a____", "b_[31m_") and len(found) == len(motion.rig.names)
+
+
 @pytest.mark.parametrize("frames", [np.arange(0, 50, 5), [0, 1, 2, 3, 20, 21, 22, 23], [4, 6, 12], [0, 0.5, 1, 1.5], [7]])
 def test_a_bvh_keeps_the_time_of_a_motion_without_all_its_frames(tmp_path: Path, frames: list[float]) -> None:
     whole = flail(person(), 50)

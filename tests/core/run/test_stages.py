@@ -12,6 +12,7 @@ import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
@@ -257,6 +258,22 @@ def test_a_run_of_a_copy_computes_nothing_and_of_another_image_everything(
     other_picture(next(iter(sorted((copy / "L").glob("*1.png")))))
     assert main.main(argv) == 0 and "Nothing has changed" not in capfd.readouterr().out
     assert (out / "clouds" / "0001.ply").read_bytes() != cloud
+
+
+def test_a_fitted_body_is_not_replaced_by_that_of_another_take_or_of_fewer_frames(plane_take: Path, tmp_path: Path) -> None:
+    """`measure` of another take, or of two frames for a quick look, deleted a finished body without a word."""
+    out, given = tmp_path / "out", {"growing": {"spacing_px": 16}}
+    pipeline.run(plane_take, out, given, frames=(0, 3))
+    take = copied(plane_take, tmp_path / "another")
+    (take / "take.toml").write_text((take / "take.toml").read_text() + "\n# another\n")
+    files = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    for folder, frames, said in ((take, (0, 3), "of another take"), (plane_take, (0, 2), "of the frames 0:3; for 0:2 alone choose")):
+        other_picture(take / "L" / "0001.png")
+        with pytest.raises(InputError, match=said), take_run.open_run(folder, out, given, frames):
+            pass
+        assert files == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with take_run.open_run(plane_take, out, given, (0, 2), restart=True) as again:
+        assert not again.record["stages"] and not (out / "clouds").exists()
 
 
 def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_they_are_measured(plane_take: Path, tmp_path: Path) -> None:
