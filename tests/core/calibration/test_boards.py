@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core.calibration.boards import footage as board_footage
 from tricap.core.calibration.boards.board import Board, BoardKind, Lens
 from tricap.core.calibration.boards.calibration import _remarks_on_moved_cameras
 from tricap.core.calibration.boards.detection import Variant, find_corners, find_variant
@@ -380,7 +381,9 @@ def test_images_without_a_board_are_refused(tmp_path: Path, capsys: pytest.Captu
         (tmp_path / view).mkdir()
         cv2.imwrite(str(tmp_path / view / "0.png"), np.random.default_rng(0).integers(0, 255, (96, 128)).astype(np.uint8))
     assert (
-        main(["calibrate", str(tmp_path), "--board", "chessboard", "--squares", "9x6", "--square", "0.1", "--out", str(tmp_path / "r")])
+        main(
+            ["calibrate", str(tmp_path), "--board", "chessboard", "--squares", "9x6", "--square", "0.1", "--out", str(tmp_path / "r.toml")]
+        )
         == 2
     )
     assert "View L" in (shown := capsys.readouterr().err) and "never shows the chessboard of 9×6 inner corners" in shown
@@ -394,12 +397,21 @@ def test_a_charuco_board_whose_sides_were_exchanged_is_recognised(tmp_path: Path
     assert "but one of 5×4; give 5×4" in capsys.readouterr().err
 
 
-def test_a_board_whose_squares_were_counted_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_whose_squares_were_counted_is_recognised(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before all images are searched in vain: of hundreds, that takes minutes."""
+    searched, find = list[str](), board_footage.find_corners
+    monkeypatch.setattr(board_footage, "TRIED_IMAGES", 2)
+    monkeypatch.setattr(
+        board_footage, "find_corners", lambda image, board, *how: [searched.append(board.label), find(image, board, *how)][1]
+    )
     cameras = tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2])
     filmed(tmp_path / "board", CHESSBOARD, cameras, 3)
-    described = ["--board", "chessboard", "--squares", "10x7", "--square", "0.05", "--out", str(tmp_path / "r")]
+    described = ["--board", "chessboard", "--squares", "10x7", "--square", "0.05", "--out", str(tmp_path / "r.toml")]
     assert main(["calibrate", str(tmp_path / "board"), *described]) == 2
     assert "10×7 inner corners, but one of 9×6: inner corners are where four squares meet; give 9×6." in capsys.readouterr().err
+    assert searched.count("10×7") == 2
 
 
 @pytest.mark.slow
