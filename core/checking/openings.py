@@ -2,17 +2,19 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from ..fitting.inputs.take_inputs import check_body, read_source
 from ..fitting.settings import FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..take.footage import Footage
+from ..take.footage import Footage, footage_frames
 from ..take.person_masks import check_mask, silhouette_files, silhouettes
 from ..take.sources import KeypointSource, read_picture
 from .findings import Cause, Finding, doubtful, wrong
 from .survey import LONGEST
 
-MORE_FRAMES = 1.5  # times the images of a view: keypoints of so many are of another recording or rate
+MORE_FRAMES = 1.5  # times those of the footage: keypoints of so many are of another recording or rate
 
 
 def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -> list[Finding]:
@@ -33,17 +35,21 @@ def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -
 
 
 def _keypoint_doubts(footage: Footage, source: KeypointSource) -> list[Finding]:
-    """A doubt where the keypoints of a view have far more frames than it has images.
+    """A doubt where the keypoints go on far beyond the end of the footage.
 
     Raises:
         InputError: they cannot be used.
     """
-    last = int(read_source(footage, source).frame.max())
-    sequences = [s for view, s in zip(footage.take.views, footage.sequences) if source.view in ("", view.name)]
-    images = max(len(sequence.files()) if len(sequence.files()) > 1 else sequence.count for sequence in sequences)
-    if last < MORE_FRAMES * images or footage.take.frames is not None and images == len(footage.frames):
+    found, views = read_source(footage, source), [view.name for view in footage.take.views]
+    last = int(found.frame.max())
+    if source.view:
+        view = views.index(source.view)
+        end = int(footage.frames_of_images(view, np.array([footage.sequences[view].count - 1]))[0])
+    else:
+        end = footage_frames(footage.take, footage.sequences).stop - 1
+    if last <= MORE_FRAMES * max(end, 1):
         return []
-    sentence = f"The keypoints “{source.files}” go on to frame {last}, where the footage has {images} images."
+    sentence = f"The keypoints “{source.files}” go on to frame {last}, and the footage ends with frame {end}."
     return [doubtful(Cause.FRAME_RATE, sentence, "Are they of the same recording, at the same number of images per second?")]
 
 

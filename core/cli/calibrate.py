@@ -44,9 +44,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.out is None:
         raise InputError("Give --out with the rig to write, such as --out rig.toml.")
     if not args.format and args.out.suffix.lower() != RIG and not args.out.is_dir():
-        raise InputError(
-            f"--out {args.out} is no name of a rig, which ends in {RIG}; choose such a name, or another tool's format with --export."
-        )
+        raise InputError(f"--out {args.out} must end in {RIG}; for another tool's format give --export.")
     return _convert(args) if args.source is not None else _calibrate(args, board, monitor)
 
 
@@ -173,7 +171,7 @@ def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) 
             written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
         figures = report.figures(result.calibration, result.quality, result.verdict)
-        figures["remarks"] += _lens_notes(args, result.rig)
+        figures["remarks"] += [*args.started, *_lens_notes(args, result.rig)]
         return [json.dumps(figures, indent=1, ensure_ascii=False)]
     remarks = [f"{line[0].upper()}{line[1:]}." for line in result.calibration.remarks]
     return [
@@ -214,8 +212,9 @@ def _starts(args: argparse.Namespace, monitor: Monitor, folder: Path) -> Starts 
 
 def _other_rates(folder: Path) -> list[str]:
     """A sentence where the films in a folder state different rates, and their images are taken to belong together one by one."""
-    films = sorted(path for path in folder.iterdir() if path.suffix.lower() in MOVIE_ENDINGS) if folder.is_dir() else []
-    rates = {path.stem: movie_rate(path) for path in films}
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    films = [path for path in paths if path.suffix.lower() in MOVIE_ENDINGS and path.name[0] != "."]
+    rates = {path.stem: rate for path in films if (rate := movie_rate(path)) > 0}
     if not rates or max(rates.values()) <= (1 + SAME_RATE) * min(rates.values()):
         return []
     stated = ", ".join(f"{name} {rate:.5g}" for name, rate in rates.items())

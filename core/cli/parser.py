@@ -105,6 +105,7 @@ def _stages(commands: Any) -> None:
             parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
             parser.add_argument("--json", action="store_true", help="print run.json at the end, and nothing else on standard output")
             parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+            parser.add_argument("--restart", action="store_true", help="start again instead of resuming")
         _set_argument(parser)
         preset = "method.preset={}".format
         about = "the settings that are not set otherwise: the defaults, or the published method"
@@ -116,7 +117,6 @@ def _stages(commands: Any) -> None:
     track.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
     track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
     track.add_argument("--pictures", type=Path, metavar="DIR", help="with --points: also draw the points and their paths over the images")
-    everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
     where = everything.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, metavar="N", help="processes that measure frames at once (default: one for every core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, such as tcp://farm:8786, whose workers measure frames")

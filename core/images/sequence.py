@@ -38,6 +38,7 @@ MARKED = (
     "ffmpeg -i {name} -vf setfield=prog -c:v ffv1 new.mkv"
 )
 AVI = ".avi"  # whose header has the number of images, written at the end of a recording
+SOON = 1000  # images in an AVI file's header, up to which it is compared with the file before anything is computed
 CUT = (
     "The header of {path} has {count} images, but more follow, as after a recording that did not end properly; "
     "write it anew: ffmpeg -i {name} -c copy new.mkv"
@@ -171,6 +172,8 @@ class Movie:
             raise InputError(OTHER_SIZE.format(path=path, w=w, h=h, size=size_px))
         self._count = count
         self._packets.at(0)
+        if self._count <= SOON:
+            self._refuse_more()
         if self._packets.may_be_interlaced and count > 1:
             self.read(0), self.read(1)
 
@@ -213,12 +216,17 @@ class Movie:
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
         self._refuse_change(index)
-        if index == self._count - 1 and self._path.suffix.lower() == AVI and self._packets.exceed(self._count):
-            raise InputError(CUT.format(path=self._path, count=self._count, name=shlex.quote(self._path.name)))
+        if index == self._count - 1:
+            self._refuse_more()
         if self._packets.may_be_interlaced and np.array_equal(before, image):  # each frame has the noise of a camera
             raise InputError(MARKED.format(path=self._path, name=shlex.quote(self._path.name)))
         self._last = image
         return grey(image)
+
+    def _refuse_more(self) -> None:
+        """The images beyond those of the header would be left out in silence."""
+        if self._path.suffix.lower() == AVI and self._packets.exceed(self._count):
+            raise InputError(CUT.format(path=self._path, count=self._count, name=shlex.quote(self._path.name)))
 
     def _refuse_change(self, index: int) -> None:
         """The decoder would scale such pictures, so that they fit no calibration."""

@@ -22,8 +22,8 @@ SPEED_M_S = 2.0  # m/s in depth, of a walking person
 MARGIN_M = 0.30  # m that a person may move in depth between frames, and by which a limb may exceed the cloud of the frame before
 FURTHEST_LIMB_M = 1.2  # m in front of the middle of a person's depths
 CLOUD_PERCENT = (1, 99)  # percentiles of a cloud's depths that are taken as its limits
-GROUP_CELL_M, GROUP_CELLS = 0.2, 2  # cubes, of which points in one and in the second next to it belong together
-GROUP = 6  # points; smaller groups do not show where the person is
+CUBE_M, CUBES_APART = 0.2, 2  # points belong together whose cubes are at most two apart
+FEWEST_IN_GROUP = 6  # points; smaller groups do not show where the person is
 MIN_CLOUD = 20  # points of a cloud; fewer do not change the depths
 CLUSTER_WIDTH = 0.12  # of log depth
 CLUSTER_SHARE = 0.3  # of the seeds in the richest cluster
@@ -120,15 +120,19 @@ def nearest_surface(depth_m: np.ndarray) -> Foreground:
     )
 
 
-def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, confirmed: bool = True) -> Foreground:
+def after(
+    depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, near_m: np.ndarray | None = None, confirmed: bool = True
+) -> Foreground:
     """The depths in the next frame, from those of the person in this one; fewer than `fewest` points change nothing.
 
+    `near_m`: the depths by which the near end is judged, by default all. The far end follows it: it is no further away than at first.
     Where matches are not `confirmed` by a third view, as many seeds may be false as true, everywhere before the person: then the depths
     keep the richest cluster.
     """
     if len(depth_m) < fewest:
         return before
-    low, high = (float(depth) for depth in np.percentile(depth_m, CLOUD_PERCENT))
+    high = float(np.percentile(depth_m, CLOUD_PERCENT[1]))
+    low = float(np.percentile(depth_m if near_m is None else near_m, CLOUD_PERCENT[0]))
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
     near, latest = max(NEAREST_M, NEARER * low, low - MARGIN_M), -np.inf
     if not confirmed:
@@ -138,17 +142,19 @@ def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD, *, c
     return Foreground(depth_range_m=(near, far), method="frame before", planes=before.planes)
 
 
-def gathered(xyz_m: np.ndarray) -> np.ndarray:
+def without_small_groups(xyz_m: np.ndarray) -> np.ndarray:
     """Points (N, 3) without small groups apart from the others: a place of the background can be matched falsely in every frame."""
+    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     if not len(xyz_m):
         return xyz_m
-    cells, cell, count = np.unique(np.floor(xyz_m / GROUP_CELL_M), axis=0, return_inverse=True, return_counts=True)
-    joined = np.abs(cells[:, None] - cells).max(axis=2) <= GROUP_CELLS
-    group = connected_components(joined, directed=False)[1]
-    large = np.bincount(group, count) >= GROUP
-    return xyz_m[large[group][cell.ravel()]] if large.any() else xyz_m
+    cubes, cube, count = np.unique(np.floor(xyz_m / CUBE_M), axis=0, return_inverse=True, return_counts=True)
+    a, b = cKDTree(cubes).query_pairs(CUBES_APART, p=np.inf, output_type="ndarray").T
+    group = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(len(cubes), len(cubes))), directed=False)[1]
+    large = np.bincount(group, count) >= FEWEST_IN_GROUP
+    return xyz_m[large[group][cube.ravel()]] if large.any() else xyz_m
 
 
 def _neighbours(position: np.ndarray) -> np.ndarray:

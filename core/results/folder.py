@@ -34,6 +34,7 @@ MADE_BY = {  # what of them the stages write, and others need
 }
 
 MOST_ROW = 1 << 16  # bytes of a row of a table
+
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
 PARENTS = ("cache", FIELDS)  # whose folders are written to
 WRITTEN = (
@@ -254,16 +255,17 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 def _ends_with(path: Path, frame: int) -> bool:
-    """Whether a file is a table whose last row is whole, and of this frame."""
+    """Whether a file is a table whose last row is of this frame, with as many columns as the first."""
     if path.suffix != ".csv":
         return False
     try:
         with bounded.opened(path, bounded.TABLE_BYTES) as file:
+            columns = file.readline(MOST_ROW).count(b",")
             file.seek(max(0, file.seek(0, os.SEEK_END) - MOST_ROW))
-            *_, row, rest = [b"", *file.read().replace(b"\r", b"").split(b"\n")]
+            last = file.read().replace(b"\r", b"").removesuffix(b"\n").rpartition(b"\n")[2]
     except OSError:
         return False
-    return not rest and row.startswith(f"{frame},".encode())
+    return last.startswith(f"{frame},".encode()) and last.count(b",") == columns
 
 
 def _is_damaged(path: Path) -> bool:

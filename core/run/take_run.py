@@ -12,7 +12,7 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
-from ..foundation import bounded, store
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled
 from ..report.pages import check_pictured
@@ -156,6 +156,7 @@ def open_run(
     restart: bool = False,
     for_contours: bool = False,
     needs_body: bool = False,
+    spares_body: bool = False,
     pictures: Sequence[int] = (),
     clicked: Callable[[Take], Take] | None = None,
 ) -> Iterator[Run]:
@@ -164,7 +165,8 @@ def open_run(
     What an earlier run of other input left in OUT is removed (with `for_contours` surface and tracks alone: the files of a fit stay until
     the next one); `restart` removes it all. A body.blend that somebody edited, and an outline that was drawn on other images, get another
     name; `notes` has the sentences that say so, and so has an error that follows. `needs_body`: a body of the same input must be there, but
-    for its outlines. `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
+    for its outlines. `spares_body`: one of another take, or of frames that are left out now, is not removed. `pictures`: the frames of the
+    report's, by default a few. `clicked`: gives the take with other clicks than its own.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -186,7 +188,8 @@ def open_run(
         outlines, notes = _outlines(results, before, footage, digests, check=not for_contours)
         with _with_errors(notes):
             keys = _known(results, before, stage_keys(footage, settings, Path(out)), by_content)
-            _check_not_lost(results.folder, before, footage, keys)
+            if spares_body:
+                _check_body_not_replaced(results.folder, before, footage, keys)
             kept = _kept_stages(results, before, keys, for_contours=for_contours, needs_body=needs_body)
             record, incomplete = new_record(footage, settings) | {drawn_outlines.ENTRY: outlines}, lost(results.folder, before)
             record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
@@ -215,23 +218,23 @@ def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> Non
         )
 
 
-def _check_not_lost(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
-    """Check that a finished body is not replaced by that of another take, or of some of its frames.
+def _check_body_not_replaced(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
+    """Check that a finished body is not replaced by that of another take, or of other frames that lack some of its own.
 
     Raises:
         InputError: it would be.
     """
-    stages, now = before.get("stages", {}), footage.frames
-    if "fit" not in stages or "measure" in valid_stages(before, keys):
+    stages, take, now = before.get("stages", {}), footage.take, footage.frames
+    if "fit" not in stages or "not_done" in stages["fit"] or "measure" in valid_stages(before, keys):
         return
     advice = "choose another folder for the results, or replace them with --restart."
-    take, text = before.get("take", ""), store.digest(footage.take.folder / "take.toml")
-    copied = Path(take).name == footage.take.folder.name or before.get("inputs", {}).get("take.toml") == text
-    if bounded.is_plain(take) and not copied:
-        raise InputError(f"{folder} has the fitted body of another take, {take}; {advice}")
+    earlier, text = Path(before.get("take", "")), store.digest(take.folder / "take.toml")
+    is_moved = not (earlier / "take.toml").is_file()  # or a copy that was not changed yet
+    if earlier != take.folder and not is_moved and before.get("inputs", {}).get("take.toml") != text:
+        raise InputError(f"{folder} has the fitted body of another take, {earlier}; {advice}")
     first, end = before.get("frames", (now.start, now.stop))
-    if first <= now.start and now.stop <= end and len(now) < end - first:
-        raise InputError(f"{folder} has the fitted body of the frames {first}:{end}; for {now.start}:{now.stop} alone {advice}")
+    if before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
+        raise InputError(f"{folder} has the fitted body of the frames {first}:{end}; for {now.start}:{now.stop} {advice}")
 
 
 def _kept_stages(

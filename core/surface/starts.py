@@ -123,8 +123,12 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
         where, seeds = _first_foreground(now, settings, monitor)
     else:
         confirmed = now.views.required_matches(settings.growing.pairs) > 1
-        depth = now.views.base.to_camera(fg.gathered(before.person_m))[:, 2] if confirmed else _sure_depths(now.views, before)
-        where = fg.after(depth, before.where, MIN_SEEDS if before.field is None else fg.MIN_CLOUD, confirmed=confirmed)
+        fewest = MIN_SEEDS if before.field is None else fg.MIN_CLOUD
+        if confirmed:
+            depth, near = (now.views.base.to_camera(xyz)[:, 2] for xyz in (before.person_m, fg.without_small_groups(before.person_m)))
+            where = fg.after(depth, before.where, fewest, near_m=near)
+        else:
+            where = fg.after(_sure_depths(now.views, before), before.where, fewest, confirmed=False)
         if before.field is None:
             seeds = _swept(now, settings, where.depth_range_m, monitor, _about_person(now, before.person_m))
         else:

@@ -87,11 +87,7 @@ def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: 
     for c in range(len(footage.names)):
         corners, size = _view(footage, c, wanted, board, variant, monitor, note)
         if not corners:
-            _refuse_other_board(footage, c, wanted, board)
-            raise InputError(
-                f"{_never_shown(footage, c, board)}; check the numbers of {_counted(board)} across and down, and hold the whole board in "
-                "the image, flat, lit and close."
-            )
+            _refuse(footage, c, wanted, board)
         found.append(corners)
         sizes.append(size)
     if footage.clocks is not None:
@@ -147,8 +143,6 @@ def _view(
             corners[int(footage.numbers[c][i])] = xy
         if note is not None:
             note(name, done + 1, len(corners))
-        if done + 1 == TRIED_IMAGES and not corners:  # a search in vain takes long, and there may be hundreds of images
-            _refuse_other_board(footage, c, wanted, board)
     monitor.step(f"board {name}", len(at), len(at))
     return corners, size
 
@@ -176,24 +170,12 @@ def _even(numbers: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([np.arange(0), *(runs[i] for i in some)])[: max(count, 0)]
 
 
-def _counted(board: Board) -> str:
-    return "inner corners" if board.kind is BoardKind.CHESSBOARD else "squares"
-
-
-def _never_shown(footage: BoardFootage, c: int, board: Board) -> str:
-    name = footage.names[c]
-    return f"View {name} in {footage.folder} never shows the {board.kind.value} of {board.label} {_counted(board)}"
-
-
-def _refuse_other_board(footage: BoardFootage, c: int, wanted: list[np.ndarray], board: Board) -> None:
-    """Refuse a view that shows another board than the one given, or this one mirrored.
-
-    Raises:
-        InputError: it does.
-    """
+def _refuse(footage: BoardFootage, c: int, wanted: list[np.ndarray], board: Board) -> None:
+    """Say why a view never shows the board."""
     at = np.flatnonzero(np.isin(footage.numbers[c], wanted[c]))
     images = [footage.sequences[c].read(int(i)) for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]]
-    start = _never_shown(footage, c, board)
+    start = f"View {footage.names[c]} in {footage.folder} never shows the {board.kind.value} of {board.label}"
+    counted = "inner corners" if board.kind is BoardKind.CHESSBOARD else "squares"
     if board.kind is BoardKind.CHARUCO:
         if find_variant(images, board, MIRRORED)[1]:
             raise InputError(f"{start}, but its images are mirrored; flip them horizontally.")
@@ -202,9 +184,14 @@ def _refuse_other_board(footage: BoardFootage, c: int, wanted: list[np.ndarray],
             if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:2])[1]:
                 raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
         if (other_size := _other_charuco(images, board)) is not None:
-            raise InputError(f"{start}, but one of {other_size.label}; give {other_size.label}.")
+            raise InputError(f"{start} squares, but one of {other_size.label}; give {other_size.label}.")
     elif (other_size := _other_size(images[:: max(1, len(images) // GUESSED_IMAGES)], board)) is not None:
-        raise InputError(f"{start}, but one of {other_size.label}: inner corners are where four squares meet; give {other_size.label}.")
+        raise InputError(
+            f"{start} {counted}, but one of {other_size.label}: inner corners are where four squares meet; give {other_size.label}."
+        )
+    raise InputError(
+        f"{start} {counted}; check the numbers of {counted} across and down, and hold the whole board in the image, flat, lit and close."
+    )
 
 
 def _other_size(images: list[np.ndarray], board: Board) -> Board | None:

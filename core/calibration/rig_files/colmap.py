@@ -23,7 +23,7 @@ MODELS = {
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
 
-QUATERNION = 0.01  # its length is 1 ±
+LENGTH_TOLERANCE = 0.01  # of a quaternion, whose length is 1
 
 
 def read(path: Path) -> Rig:
@@ -42,7 +42,7 @@ def read(path: Path) -> Rig:
         if line[8] not in lenses:
             raise InputError(f"Image {line[0]} in {folder / 'images.txt'} names camera {line[8]}, which cameras.txt lacks.")
         size, matrix, distortions = _interior(lenses[line[8]], folder)
-        if abs((length := np.linalg.norm(values[:4])) - 1) > QUATERNION:
+        if abs((length := np.linalg.norm(values[:4])) - 1) > LENGTH_TOLERANCE:
             raise InputError(f"Image {line[0]} in {folder / 'images.txt'} has no rotation: its quaternion is {length:.3g} long, not 1.")
         R = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
         image = Path(" ".join(line[9:]))

@@ -163,7 +163,7 @@ def _rig(cameras: tuple[Camera, ...], sizes_px: Sequence[Sequence[float | None]]
     if not without:
         return Rig(cameras=cameras)
     sizes = ", ".join(f"{camera.name} {camera.size_px[0]}×{camera.size_px[1]}" for camera in without)
-    remark = f"The file lacks these sizes of images, so they were derived from the principal points ({sizes}); compare with the footage."
+    remark = f"The file lacks the image size of some cameras, derived from the principal points ({sizes}); compare with the footage."
     return Rig(cameras=cameras, remarks=(remark,))
 
 

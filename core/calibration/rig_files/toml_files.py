@@ -46,8 +46,6 @@ def read(path: Path) -> Rig:
     remarks = left_out([str(entries[key].get("name", key)) for key in ignored], "they are marked `ignore`")
     if rounded := [cameras[key].name for key in finished if any(side != round(side) for side in finished[key]["size"])]:
         remarks += (f"The file has sizes that are no whole pixels, which were rounded ({', '.join(rounded)}); compare with the footage.",)
-    if turned := [cameras[key].name for key in finished if finished[key].get("rotation_count")]:
-        remarks += (f"Calibrated on pictures that were turned (`rotation_count` of {', '.join(turned)}); turn the footage likewise.",)
     return Rig(cameras=tuple(cameras.values()), metadata=metadata if isinstance(metadata, dict) else {}, sigmas=sigmas, remarks=remarks)
 
 

@@ -196,9 +196,11 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
 
 def _check_pixels(source: KeypointSource, xy_px: np.ndarray, size_px: tuple[int, int]) -> None:
     outside = ((xy_px < -BEYOND * np.array(size_px)) | (xy_px > (1 + BEYOND) * np.array(size_px))).any(axis=1)
-    where = (
-        "between 0 and 1" if (np.abs(xy_px) <= 1).all() else f"outside of its images of {size_px[0]}×{size_px[1]}" if outside.all() else ""
-    )
+    where = ""
+    if outside.all():
+        where = f"outside of its images of {size_px[0]}×{size_px[1]}"
+    elif (np.abs(xy_px) <= 1).all():
+        where = "between −1 and 1"
     if where:
         raise InputError(
             f"All points of the keypoints “{source.files}” of view {source.view} lie {where}; give pixels of the images that the take has."
@@ -225,7 +227,7 @@ def _markers(path: Path, axes: str | None) -> Markers:
 def _places(
     source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray, path: Path
 ) -> JointPlaces:
-    """The joints of a file, one row per place; the sigma of a point of confidence c is divided by √c, where c is at most 1."""
+    """The joints of a file, one row per place; the sigma of a point of confidence c is divided by √c."""
     for name in source.names:
         if name not in names:
             raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Correct `names` under [[keypoints]].")
@@ -237,7 +239,8 @@ def _places(
         if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()
     ]
     if not rows and any(joints):
-        raise InputError(f"No point in {path} has a confidence of {LEAST_CONFIDENCE:g} or more; detect the joints again.")
+        lacking = f" of a confidence of {LEAST_CONFIDENCE:g} or more" if source.view else ""
+        raise InputError(f"The keypoints “{source.files}” have no joint of the body with a place{lacking}; detect the joints again.")
     if not rows:
         raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of the body; map them under `names`.")
     t, n = np.array(rows).T
@@ -247,7 +250,7 @@ def _places(
         frame=frames[t],
         joint=tuple(joints[i] for i in n),
         place=places[t, n],
-        sigma=source.sigma * loose[n] / np.sqrt(np.minimum(confidence[t, n], 1.0)),
+        sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]),
     )
 
 

@@ -328,7 +328,7 @@ def _free_heads(motion: Motion) -> np.ndarray:
 
 
 def _name(name: str) -> str:
-    """A name as one word of the file: without blanks, braces and what cannot be printed."""
+    """A name as one word of the file: blanks, braces and what cannot be printed become “_”."""
     return "".join("_" if c in " {}" or not c.isprintable() else c for c in name)
 
 

@@ -196,12 +196,13 @@ def test_the_command_calibrates_with_both(tmp_path: Path, capsys: pytest.Capture
         film = cv2.VideoWriter(str(tmp_path / f"{view}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), rate, (64, 48))
         film.write(np.zeros((48, 64, 3), np.uint8))
         film.release()
+    (tmp_path / "._L.avi").write_bytes(b"of another system")
     (said,) = _other_rates(tmp_path)
     assert "(C 30, L 25 images per second)" in said and "--rates C=30,L=25" in said and not _other_rates(tmp_path / "board")
     for arguments, message in (
         ([*bar, *board[:2]], "--with-board needs the board"),
         ([*bar, "--lenses-only"], "--lenses-only belongs to --with-board"),
         ([*bar[:2], *bar[4:], *board], "The bar's length is missing"),
-        ([*bar[:-1], str(tmp_path / "board" / "L" / "000.png"), *board], "is no name of a rig, which ends in .toml"),
+        ([*bar[:-1], str(tmp_path / "board" / "L" / "000.png"), *board], "must end in .toml"),
     ):
         assert main(arguments) == 2 and message in capsys.readouterr().err

@@ -128,15 +128,25 @@ def test_what_a_run_refuses_the_check_finds(plane_take: Path, tmp_path: Path, fa
     assert said in str(refused.value)
 
 
+def write_keypoints(take: Path, image: int, person: list[float]) -> None:
+    store.write_json(take / "kp" / f"{image:04d}.json", {"people": [{"pose_keypoints_2d": person}]})
+
+
 def test_keypoints_of_another_rate_are_doubtful(plane_take: Path, tmp_path: Path) -> None:
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))
     arm(take, CLICKS + '[[keypoints]]\nfiles = "kp/*.json"\nview = "C"\n')
+    table = (take / "take.toml").read_text()
     person, images = [50.0, 60.0, 0.9] * 25, len([*(take / "C").iterdir()])
     for frames, doubts in ((images, 0), (4 * images, 1)):
         for i in range(frames):
-            store.write_json(take / "kp" / f"{i:04d}.json", {"people": [{"pose_keypoints_2d": person}]})
+            write_keypoints(take, i, person)
         found = opening_findings(open_take(read_take(take)), FitSettings(), Monitor())
-        assert [f"the footage has {images} images" in f.sentence and not f.certain for f in found] == [True] * doubts
+        assert [f"the footage ends with frame {images - 1}" in f.sentence and not f.certain for f in found] == [True] * doubts
+    shutil.rmtree(take / "kp")
+    (take / "take.toml").write_text(table.replace('"none"', '"both"', 1))
+    for i in range(images):
+        write_keypoints(take, i, person)
+    assert not opening_findings(open_take(read_take(take)), FitSettings(), Monitor()), "each image has two frames"
 
 
 def test_sound_masks_are_no_finding_and_settings_are_checked(plane_take: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -205,7 +205,7 @@ def movie_pictures(frames: int) -> list[np.ndarray]:
     return pictures
 
 
-def test_a_movie_whose_header_has_too_few_images_is_refused_at_its_end(tmp_path: Path) -> None:
+def test_a_movie_whose_header_has_too_few_images_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a recorder that crashed; of sixteen images thirteen were left out in silence."""
     path = write_movie(tmp_path / "m.avi", 12)
     whole = bytearray(path.read_bytes())
@@ -214,9 +214,13 @@ def test_a_movie_whose_header_has_too_few_images_is_refused_at_its_end(tmp_path:
         assert int.from_bytes(whole[place : place + 4], "little") == 12
         whole[place : place + 4] = (3).to_bytes(4, "little")
     path.write_bytes(whole)
+    said = "has 3 images, but more follow.*ffmpeg -i m.avi -c copy new.mkv"
+    with pytest.raises(InputError, match=said):
+        Movie(path)
+    monkeypatch.setattr(sequence, "SOON", 0)  # as of a long film, which would take long to read
     movie = Movie(path)
     assert movie.count == 3 and movie.read(1).shape == (48, 64)
-    with pytest.raises(InputError, match="has 3 images, but more follow.*ffmpeg -i m.avi -c copy new.mkv"):
+    with pytest.raises(InputError, match=said):
         movie.read(2)
     assert len(Movie(write_movie(tmp_path / "whole.avi", 12)).read(11)) == 48
 

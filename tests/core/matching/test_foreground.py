@@ -6,7 +6,7 @@ import numpy as np
 
 from tricap.core.images.interlace import row_grid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.foreground import MARGIN_M, Foreground, after, gathered
+from tricap.core.matching.foreground import MARGIN_M, Foreground, after, without_small_groups
 from tricap.core.matching.seeds import at_an_end
 from tricap.core.matching.views import Views
 
@@ -59,12 +59,13 @@ def test_a_person_who_walks_away_is_followed_though_a_place_of_the_wall_is_alway
         np.array([[1.3, 0.9, 2.62], [1.45, 0.92, 2.68], [1.3, 0.75, 2.66]]),
         np.random.default_rng(3).normal(0, (0.2, 0.5, 0.1), (70, 3)),
     )
-    for sift, followed_by in ((gathered, True), (lambda xyz: xyz, False)):
+    for sift, followed_by in ((without_small_groups, True), (lambda xyz: xyz, False)):
         where = Foreground(depth_range_m=(2.4, 3.7), method="nearest surface")
         for middle in np.arange(3.0, 4.5, 0.04):
             seen = np.concatenate([seeds + [0, 0, middle], false])
             near, far = where.depth_range_m
-            where = after(sift(seen[(seen[:, 2] > near) & (seen[:, 2] < far)])[:, 2], where)
+            person = seen[(seen[:, 2] > near) & (seen[:, 2] < far)]
+            where = after(person[:, 2], where, near_m=sift(person)[:, 2])
         assert (where.depth_range_m[1] > 4.5 + 0.15) == followed_by
 
 
@@ -73,5 +74,5 @@ def test_parts_of_a_person_that_are_apart_are_kept() -> None:
     feet, head, trunk = (random.normal(middle, 0.05, (n, 3)) for middle, n in (((0, 0.9, 3), 8), ((0, -0.8, 3), 6), ((0, 0, 3), 40)))
     stray = np.array([[2.0, 0.0, 2.0], [-2.0, 0.0, 4.0]])
     together = np.concatenate([feet, head, trunk])
-    assert np.array_equal(gathered(np.concatenate([together, stray])), together)
-    assert len(gathered(stray)) == 2 and len(gathered(np.zeros((0, 3)))) == 0, "without a group all stay"
+    assert np.array_equal(without_small_groups(np.concatenate([together, stray])), together)
+    assert len(without_small_groups(stray)) == 2 and len(without_small_groups(np.zeros((0, 3)))) == 0, "without a group all stay"

@@ -201,7 +201,7 @@ def test_what_was_written_and_is_gone_or_cut_is_known(tmp_path: Path) -> None:
     assert lost(tmp_path, run) == {"fit": ["joints.csv", "skin"], "report": ["report/report.html"]}
     run["frames"], rows = [0, 3], ["frame,x\r\n", "0,1.5\r\n", "1,1.5\r\n", "2,1\r\n"]
     run["files"]["joints.csv"] = [1, 100]
-    for kept, complete in ((rows, True), (rows[:-1], False), ([*rows[:-1], "2,"], False), ([], False)):
+    for kept, complete in ((rows, True), (rows[:-1], False), ([*rows[:-1], "2,1"], True), ([*rows[:-1], "2\r\n"], False), ([], False)):
         (tmp_path / "joints.csv").write_text("".join(kept), newline="")
         assert ("joints.csv" not in lost(tmp_path, run)["fit"]) == complete, "an edited table may be shorter, a cut one may not"
     for size in (3, [1], ["1", 2], [1, 2.5]):

@@ -1,5 +1,6 @@
 """What a change concerns: the right stages become stale, and only those."""
 
+import json
 import os
 import shutil
 from dataclasses import fields
@@ -12,7 +13,6 @@ import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation import store
-from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
@@ -260,20 +260,36 @@ def test_a_run_of_a_copy_computes_nothing_and_of_another_image_everything(
     assert (out / "clouds" / "0001.ply").read_bytes() != cloud
 
 
-def test_a_fitted_body_is_not_replaced_by_that_of_another_take_or_of_fewer_frames(plane_take: Path, tmp_path: Path) -> None:
+def test_a_fitted_body_is_not_replaced_by_that_of_another_take_or_of_fewer_frames(
+    plane_take: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     """`measure` of another take, or of two frames for a quick look, deleted a finished body without a word."""
-    out, given = tmp_path / "out", {"growing": {"spacing_px": 16}}
-    pipeline.run(plane_take, out, given, frames=(0, 3))
-    take = copied(plane_take, tmp_path / "another")
-    (take / "take.toml").write_text((take / "take.toml").read_text() + "\n# another\n")
+    out, given = tmp_path / "out", ["--set", "growing.spacing_px=16", "--quiet"]
+    pipeline.run(plane_take, out, {"growing": {"spacing_px": 16}}, frames=(0, 3))
+    another = copied(plane_take, tmp_path / "another")
+    (another / "take.toml").write_text((another / "take.toml").read_text() + "\n# another\n")
+    other_picture(another / "L" / "0001.png")
+    record = json.loads((out / "run.json").read_text())
+    assert record["stages"]["fit"].pop("not_done")  # as with a body, which a plane has not
+    record["stages"]["fit"]["joint_sigma_mm"] = 5.0
+    (out / "run.json").write_text(json.dumps(record))
     files = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    for folder, frames, said in ((take, (0, 3), "of another take"), (plane_take, (0, 2), "of the frames 0:3; for 0:2 alone choose")):
-        other_picture(take / "L" / "0001.png")
-        with pytest.raises(InputError, match=said), take_run.open_run(folder, out, given, frames):
-            pass
-        assert files == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    with take_run.open_run(plane_take, out, given, (0, 2), restart=True) as again:
-        assert not again.record["stages"] and not (out / "clouds").exists()
+    for take, frames, said in (
+        (another, "0:3", "of another take"),
+        (plane_take, "0:2", "0:3; for 0:2"),
+        (plane_take, "1:4", "0:3; for 1:4"),
+    ):
+        assert main.main(["measure", str(take), "--out", str(out), "--frames", frames, *given]) == 2
+        assert said in capfd.readouterr().err and files == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with take_run.open_run(plane_take, out, {"growing": {"spacing_px": 16}}, (0, 4), spares_body=True):
+        pass  # more frames are no loss
+    assert main.main(["measure", str(another), "--out", str(out), "--frames", "0:2", "--restart", *given]) == 0
+
+
+def test_a_run_without_a_body_is_replaced_without_a_question(plane_take: Path, tmp_path: Path) -> None:
+    pipeline.run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, frames=(0, 3))
+    with take_run.open_run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, (0, 2), spares_body=True) as again:
+        assert not again.record["stages"]
 
 
 def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_they_are_measured(plane_take: Path, tmp_path: Path) -> None:
