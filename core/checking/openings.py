@@ -8,12 +8,13 @@ from ..fitting.inputs.take_inputs import check_body, read_source
 from ..fitting.settings import FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..take.footage import Footage, footage_frames
+from ..take.footage import Footage
 from ..take.person_masks import check_mask, silhouette_files, silhouettes
 from ..take.sources import KeypointSource, read_picture
 from .findings import Cause, Finding, doubtful, wrong
 from .survey import LONGEST
 
+LAST_IMAGES = 50  # of a view; with a clock, not every one of them is that of a frame
 MORE_FRAMES = 1.5  # times those of the footage: keypoints of so many are of another recording or rate
 
 
@@ -35,18 +36,17 @@ def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -
 
 
 def _keypoint_doubts(footage: Footage, source: KeypointSource) -> list[Finding]:
-    """A doubt where the keypoints go on far beyond the end of the footage.
+    """A doubt where the keypoints of a view go on far beyond its last image.
 
     Raises:
         InputError: they cannot be used.
     """
-    found, views = read_source(footage, source), [view.name for view in footage.take.views]
-    last = int(found.frame.max())
-    if source.view:
-        view = views.index(source.view)
-        end = int(footage.frames_of_images(view, np.array([footage.sequences[view].count - 1]))[0])
-    else:
-        end = footage_frames(footage.take, footage.sequences).stop - 1
+    last = int(read_source(footage, source).frame.max())
+    if not source.view:
+        return []
+    view = [view.name for view in footage.take.views].index(source.view)
+    images = np.arange(footage.sequences[view].count)
+    end = int(footage.frames_of_images(view, images[-LAST_IMAGES:]).max())
     if last <= MORE_FRAMES * max(end, 1):
         return []
     sentence = f"The keypoints “{source.files}” go on to frame {last}, and the footage ends with frame {end}."

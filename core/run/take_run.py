@@ -229,8 +229,8 @@ def _check_body_not_replaced(folder: Path, before: Mapping[str, Any], footage: F
         return
     advice = "choose another folder for the results, or replace them with --restart."
     earlier, text = Path(before.get("take", "")), store.digest(take.folder / "take.toml")
-    is_moved = not (earlier / "take.toml").is_file()  # or a copy that was not changed yet
-    if earlier != take.folder and not is_moved and before.get("inputs", {}).get("take.toml") != text:
+    is_there, is_copy = (earlier / "take.toml").is_file(), before.get("inputs", {}).get("take.toml") == text
+    if earlier != take.folder and is_there and not is_copy:  # a take that was moved is no longer there
         raise InputError(f"{folder} has the fitted body of another take, {earlier}; {advice}")
     first, end = before.get("frames", (now.start, now.stop))
     if before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
