@@ -11,6 +11,7 @@ from .apply import set_range
 from .write import write_action
 
 SHORTEST_M = 1e-4  # of a bone that an armature can have
+LONGEST_NAME = 63
 LOOSE = 5e-6  # by the rig's size: a head that moves less relative to its parent is rigidly attached
 
 
@@ -18,7 +19,7 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     """An armature object in the open scene that plays the motion; the scene gets its frames and rate.
 
     Raises:
-        InputError: a bone has no length.
+        InputError: a bone has no length, or a name of more than 63 bytes.
     """
     rig, scene = motion.rig, bpy.context.scene
     armature_object = armature_of_rig(rig, name, scene.collection)
@@ -50,7 +51,7 @@ def armature_of_rig(rig: Rig, name: str, collection: bpy.types.Collection) -> bp
     """An armature object with the bones of a rig, which becomes the active one.
 
     Raises:
-        InputError: a bone has no length.
+        InputError: a bone has no length, or a name of more than 63 bytes.
     """
     armature = bpy.data.armatures.new(name)
     armature_object = bpy.data.objects.new(name, armature)
@@ -62,6 +63,11 @@ def armature_of_rig(rig: Rig, name: str, collection: bpy.types.Collection) -> bp
         if length < SHORTEST_M:
             bpy.ops.object.mode_set(mode="OBJECT")
             raise InputError(f"The bone “{bone_name}” has no length; give it one in the source.")
+        if len(bone_name.encode()) > LONGEST_NAME:
+            bpy.ops.object.mode_set(mode="OBJECT")
+            raise InputError(
+                f"The bone “{bone_name[:40]}…” has a longer name than Blender allows, {LONGEST_NAME} bytes; shorten it in the source."
+            )
         bone = armature.edit_bones.new(bone_name)
         bone.head, bone.tail = rig.head_m[b], rig.head_m[b] + length * rig.R_rest[b][:, 1]
         bone.align_roll(Vector(rig.R_rest[b][:, 2]))

@@ -182,11 +182,15 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program, mov
 
 def _copy_ply(out: Path, folder: Path, of: str, monitor: Monitor) -> str:
     """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
-    first, end = (read_run(out / "run.json") if (out / "run.json").is_file() else {}).get("frames", (0, np.inf))
+    run = read_run(out / "run.json") if (out / "run.json").is_file() else {}
+    first, end = run.get("frames", (0, np.inf))
     found = ([file for file in files_of(out / name, name) if file.suffix == ".ply"] for name in ([of] if of else ["skin", "clouds"]))
     files = [file for file in next(filter(None, found), []) if first <= int(file.stem) < end]  # not a copy of the user's own
     if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
+    by = next(stage for stage, names in MADE_BY.items() if files[0].parent.name in names)
+    if by not in run["stages"] if "stages" in run else not run and (out / "cache").is_dir():
+        raise InputError(f"{files[0].parent} is not finished: the run that makes it was stopped, or goes on; run the take first.")
     for n, file in enumerate(files):
         monitor.step("exporting", n, len(files))
         read_ply(file)  # a damaged one is not spread

@@ -9,10 +9,12 @@ chain of stout bones, and the cross radii l of all balls are adjusted to the out
     √(−½ ln F(X)) − √(½ ln 2) = 0 at points X of the outline,   ln l = its value bone by bone ± `FREE`
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from dataclasses import field as attribute
 from math import degrees, isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from .anatomy import ball_names
 from .metaballs import ACROSS, THRESHOLD, VISIBLE, Metaballs, field, field_and_derivatives, three_balls
 from .model_file import MOST_LENGTHS, BodyModel, base_dofs, dof_from_table
 from .skeleton import LENGTHS_M, Bone, Skeleton, bone_frames
+from .skin.hand_template import BENDS, RELAXED
 
 SAMPLES = 10  # of the outline, per bone
 FREE = 0.3  # sigma of the prior on ln l
@@ -32,6 +35,8 @@ LARGEST_STEP = 0.2  # of ln l
 LEAST_F = 1e-6  # bounds of F, so that its logarithm …
 MOST_F = 0.99
 LEAST_ROOT_SQUARED = 0.03  # … and the derivative of the root stay finite
+LAST_LINE = "# end"  # of body.toml: without it the file was cut
+LARGEST_SIGMA = 0.48  # of ln (bend − BENDS[0]) of relaxed or bent fingers, up to where they count as measured; 0.8 of its prior's
 STOUT = 0.4  # mean radius over length: bones above it belong to the trunk
 PARALLEL = 0.98  # least cosine between consecutive bones of one chain
 
@@ -125,6 +130,18 @@ def _outline(R: np.ndarray, head: np.ndarray, model: BodyModel, lengths_m: np.nd
     return np.concatenate(points), np.concatenate(bones)
 
 
+class FingerBend(NamedTuple):
+    """How far the fingers of a hand are bent, 0 straight and 1 relaxed (`skin.hand_template`), and its sigma."""
+
+    value: float
+    sigma: float
+
+    @property
+    def measured(self) -> bool:
+        """Whether points tell it, and not its prior alone."""
+        return not self.sigma > LARGEST_SIGMA * (max(self.value, RELAXED) - BENDS[0])
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BodyShape:
     """Skeleton, bone lengths (B,) and metaballs of one person. Sigmas are one standard deviation [m]; NaN or None: not estimated."""
@@ -136,6 +153,7 @@ class BodyShape:
     length_sigma_m: np.ndarray  # (B,)
     radius_sigma_m: np.ndarray  # (M, 3) of Metaballs.radii_m
     weight_sigma: np.ndarray | None = None  # (M,) of Metaballs.weight
+    finger_bends: Mapping[str, FingerBend] = attribute(default_factory=dict)  # by the name of a hand's bone
 
     def __post_init__(self) -> None:
         b, m = len(self.skeleton.bones), len(self.metaballs.weight)
@@ -143,6 +161,14 @@ class BodyShape:
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
         if self.weight_sigma is not None:
             object.__setattr__(self, "weight_sigma", frozen(self.weight_sigma, (m,), name="weight_sigma"))
+
+    def finger_bend(self, bone: str) -> float:
+        """How far the fingers of a hand are bent: as measured, or relaxed."""
+        return self.finger_bends[bone].value if self.has_measured_fingers(bone) else RELAXED
+
+    def has_measured_fingers(self, bone: str) -> bool:
+        """Whether a bone is a hand whose fingers' bend was measured."""
+        return bone in self.finger_bends and self.finger_bends[bone].measured
 
 
 def default_shape(model: BodyModel) -> BodyShape:
@@ -207,6 +233,7 @@ def body_text(shape: BodyShape) -> str:
             f"nominal_length_m = {bone.nominal_length_m!r}",
             f"rest = {bone.R_rest.tolist()!r}  # rows; the columns are the bone's axes in the world at rest",
             f"rotation_mode = {_text(bone.rotation_mode)}",
+            *(f"finger_bend{end} = {value!r}" for end, value in zip(("", "_sigma"), shape.finger_bends.get(bone.name, ()))),
             f"dofs = [{', '.join(map(_dof, bone.dofs))}]",
             "",
         ]
@@ -225,7 +252,7 @@ def body_text(shape: BodyShape) -> str:
             *([f"weight_sigma = {float(shape.weight_sigma[i])!r}"] if shape.weight_sigma is not None else []),
             "",
         ]
-    return "\n".join(lines)
+    return "\n".join([*lines, LAST_LINE, ""])
 
 
 def read_body(path: Path) -> BodyShape:
@@ -287,6 +314,11 @@ def _shape(table: dict[str, Any]) -> BodyShape:
         radii_m=np.array([t["radii_m"] for t in balls], dtype=float).reshape(-1, 3),
         weight=np.array([t["weight"] for t in balls], dtype=float),
     )
+    bends = {
+        str(t["name"]): FingerBend(float(t["finger_bend"]), float(t.get("finger_bend_sigma", np.nan))) for t in rows if "finger_bend" in t
+    }
+    if not all(BENDS[0] < bend.value <= BENDS[1] for bend in bends.values()):
+        raise ValueError(f"finger_bend: more than {BENDS[0]:g} and at most {BENDS[1]:g} is possible")
     r = metaballs.radii_m
     if not (((r > 0) & (r <= LENGTHS_M[1])).all() and (np.abs([*metaballs.centre.ravel(), *metaballs.weight]) <= MOST_LENGTHS).all()):
         raise ValueError("radii_m, centre or weight of a metaball: no body has such a one")
@@ -298,6 +330,7 @@ def _shape(table: dict[str, Any]) -> BodyShape:
         length_sigma_m=np.array([t["sigma_m"] for t in rows], dtype=float),
         radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3),
         weight_sigma=np.array([t["weight_sigma"] for t in balls], dtype=float) if _has_weight_sigmas(balls) else None,
+        finger_bends=bends,
     )
 
 

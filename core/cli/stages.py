@@ -64,7 +64,7 @@ def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) -> list[str]:
     given = args.take, args.out, overrides(args.set), frame_range(args.frames)
-    with take_run.open_run(*given, restart=args.restart, spares_body=True) as job:
+    with take_run.open_run(*given, restart=args.restart, spares=True) as job:
         job.engine, job.record[UNTIL] = of_this_machine(), names[-1]
         for name in names:
             getattr(pipeline, name)(job, monitor)
@@ -74,7 +74,7 @@ def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """All stages, from the images to the Blender file; the lines to show."""
     given, engine = (args.take, args.out, overrides(args.set), frame_range(args.frames)), _engine(args)
-    with take_run.open_run(*given, restart=args.restart, spares_body=True, pictures=args.pictures) as job:
+    with take_run.open_run(*given, restart=args.restart, spares=True, pictures=args.pictures) as job:
         if not args.pictures and pipeline.is_complete(job):
             job.record["warnings"] = job.results.read_run().get("warnings", [])
             unchanged = "Nothing has changed since that run; --restart begins anew."

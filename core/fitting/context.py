@@ -10,6 +10,7 @@ from ..body.model_file import BodyModel
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from .explained import Evidence, explained_area
+from .hands import BEND_SIGMA
 from .inputs.background import BackgroundRegions
 from .inputs.clicks import Clicks
 from .inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints
@@ -19,6 +20,7 @@ from .inputs.silhouettes import Silhouettes
 from .observations import (
     ClickedJoints,
     EqualRadii,
+    HandPoints,
     JointLimits,
     Observation,
     Proportions,
@@ -27,6 +29,7 @@ from .observations import (
     SurfacePoints,
     Symmetry,
 )
+from .observations.hand_points import hand_owners
 from .observations.self_collision import CollisionPairs
 from .observations.shape_priors import proportions
 from .segmentation import SegmentationCache, segment, soft_segment
@@ -42,7 +45,22 @@ POINTS_OF_RAY = 3  # a limb of 25 cm has some 300 points (one a voxel), and 40 r
 LARGEST_RESIDUAL = 3.0  # sigmas of a click, or beyond a limit, that count in a score
 FEW = 0.5  # of `min_points`: a bone with fewer has lost its points
 LEAST_GAIN = 0.25  # of `min_points`: a pose from another start replaces the first one if it explains so many points more; less is noise
+HAND_SIGMA_M, HAND_PATCH_M = 0.005, 0.025  # of a hand from its capsules, and how large the patches are in which this error is the same
+HAND_GATE_M = 0.045  # from a hand, from where on a point is not the hand's
+_Owners = tuple[np.ndarray, np.ndarray, np.ndarray]  # rows of points, the bone of each, and its share
 NO_SHAPE = np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SurfaceAndHands:
+    """Points on a body's surface, and those on hands with fingers."""
+
+    surface: SurfacePoints
+    hands: HandPoints
+
+    def reweighted(self, reference: BodyState) -> "_SurfaceAndHands":
+        """The same points with weights from another reference state."""
+        return replace(self, surface=self.surface.reweighted(reference))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,11 +116,15 @@ class FitContext:
 
         Points within one patch share the model's error: the weight of their common part is divided among them (`variance_inflation`).
         """
-        s = self.settings
-        find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * gate_scale)
+        find = self._find(points, state, gate_scale)
         if cache is None:
             return self._observed(points, state, *find())
         return cache.observed(points.frame, state, find, partial(self._observed, points, state))
+
+    def _find(self, points: CloudPoints, state: BodyState, gate_scale: np.ndarray | float = 1.0) -> Callable[[], _Owners]:
+        """The segmentation of points, still to be made."""
+        s = self.settings
+        return partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * gate_scale)
 
     def _observed(self, points: CloudPoints, state: BodyState, rows: np.ndarray, bone: np.ndarray, share: np.ndarray) -> SurfacePoints:
         """Some points (rows), each with its bone and the share of it that is this bone's."""
@@ -128,6 +150,41 @@ class FitContext:
     ) -> list[Observation]:
         """Observations of the body's surface in frame index `t`: measured points and outlines."""
         return [self.surface(points, state, gate_scale, cache), *self.silhouettes.observe(t, state, cache, gate_scale)]
+
+    def with_fingers(self, t: int, points: CloudPoints, state: BodyState, cache: SegmentationCache | None = None) -> list[Observation]:
+        """As `surface_observations`; where hands were looked for and have enough points, these are on their fingers, not on metaballs."""
+        if self.turned is None:
+            return self.surface_observations(t, points, state, cache=cache)
+        find, observe = partial(self._find_with_hands, points, state), partial(self._observe_with_hands, points, state)
+        found = observe(*find()) if cache is None else cache.observed(points.frame, state, find, observe)
+        return [found.surface, found.hands, *self.silhouettes.observe(t, state, cache)]
+
+    def _find_with_hands(self, points: CloudPoints, state: BodyState) -> tuple[_Owners, tuple[np.ndarray, np.ndarray]]:
+        """The segmentation of points without those of hands, and of these: rows and bones.
+
+        A hand has its own if they are at least `min_points`, and its forearm has points: an arm that nobody sees may lie beside anything.
+        """
+        (rows, bone, share), (of_hands, hand) = self._find(points, state)(), hand_owners(points.xyz_m, points.normals, state, HAND_GATE_M)
+        count, others = (np.bincount(of, minlength=len(state.lengths_m)) for of in (hand, bone))
+        enough = (count[hand] >= self.settings.min_points) & (others[state.skeleton.parents[hand]] >= self.few_points)
+        of_hands, hand = of_hands[enough], hand[enough]
+        kept = ~np.isin(bone, hand) & ~np.isin(rows, of_hands)
+        return (rows[kept], bone[kept], share[kept]), (of_hands, hand)
+
+    def _observe_with_hands(
+        self, points: CloudPoints, state: BodyState, others: _Owners, hands: tuple[np.ndarray, np.ndarray]
+    ) -> _SurfaceAndHands:
+        """The observations of what `_find_with_hands` found."""
+        rows, bone = hands
+        own, in_patch = points.sigma_m[rows] ** 2 + VARIANCE_FLOOR_M2, max(1.0, (HAND_PATCH_M / self.settings.voxel_m) ** 2)
+        variance = own + HAND_SIGMA_M**2
+        found = HandPoints(
+            xyz_m=points.xyz_m[rows],
+            bone=bone,
+            sigma_m=np.sqrt(variance),
+            variance_inflation=(own + in_patch * HAND_SIGMA_M**2) / variance,
+        )
+        return _SurfaceAndHands(surface=self._observed(points, state, *others), hands=found)
 
     def evidence(self, t: int, points: CloudPoints, state: BodyState) -> np.ndarray:
         """The points of each bone (B,), rays of outlines and points followed in single views counted as several; a keypoint at its end
@@ -164,12 +221,13 @@ class FitContext:
             self.found,
         )
 
-    def shape_observations(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
+    def shape_observations(self, lengths: tuple[np.ndarray, np.ndarray] | None = None, weight: float = 1.0) -> list[Observation]:
         """The priors of the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where there is more than the proportions
-        (else infinite)."""
+        (else infinite). `weight`: how often they will count; that of bends counts once."""
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
         sigma[self.parameters.layout.group("weights")] = WEIGHT_SIGMA
+        sigma[self.parameters.layout.group("bends")] = BEND_SIGMA * np.sqrt(weight)
         of_lengths = self.parameters.layout.group("lengths")
         mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], np.inf)
         radii = self.parameters.template.metaballs.radii_m
@@ -238,7 +296,7 @@ def _hard(
     state: BodyState,
     surface: np.ndarray,
     gate_m: np.ndarray | float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> _Owners:
     """As `soft_segment`, with every point wholly one limb's."""
     rows, bone = segment(points, state, surface, gate_m)
     return rows, bone, np.ones(len(rows))

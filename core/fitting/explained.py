@@ -259,7 +259,8 @@ def _hands(state: BodyState, bones: np.ndarray, head: np.ndarray, R: np.ndarray,
     found = []
     for k in hands:
         length = float(state.lengths_m[bones[k]])
-        ends, radii = (part[of_hand] * length for part in hand_capsules(names[k].endswith(".L")))
+        bend = state.finger_bends[int(bones[k])]
+        ends, radii = (part[of_hand] * length for part in hand_capsules(names[k].endswith(".L"), bend))
         along = ends[:, 1] - ends[:, 0]
         lengths = np.linalg.norm(along, axis=1)
         axes = R[:, k].transpose(0, 2, 1)

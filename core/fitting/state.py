@@ -1,13 +1,14 @@
 """The state vector of the fit, [S_motion, S_skel] of D'Apuzzo et al. 1999: the layout of its parameters, and the body that a vector means.
 
 The pose of one frame (D,) [rad, m] is followed by the shape (S,), which all frames share: ln of the bone lengths (B,), then ln of the cross
-radii l_x and l_z of every ball (M, 2), and, where they are free, ln of the balls' weights w (M). Logarithms keep lengths positive and make
-their sigmas relative. A ball's centre and its radius along the bone scale with the bone.
+radii l_x and l_z of every ball (M, 2), where they are free ln of the balls' weights w (M), and ln (bend + BACK) of the fingers of each hand
+(H), which metaballs do not have. Logarithms keep lengths positive and make their sigmas relative. A ball's centre and its radius along the
+bone scale with the bone.
 
 Jacobians in blocks: an observation of one body part depends on few parameters; the zeros are neither stored nor multiplied.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -15,9 +16,11 @@ import numpy as np
 
 from ..body.metaballs import Metaballs
 from ..body.parts import BoneProfile, ProfileTable, bone_profiles, chain_neighbours
-from ..body.shape import BodyShape
+from ..body.shape import BodyShape, FingerBend
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
+from ..body.skin.hand_template import BENDS, RELAXED
 from ..geometry.rotation import cross, cross_matrix
+from .hands import BACK, hands_of
 
 CROSS = [0, 2]  # the two axes across a bone
 FIRM_PRIOR = float(np.radians(20.5))  # a DOF whose prior has a smaller sigma needs no observations of its own
@@ -26,16 +29,16 @@ FIRM_PRIOR = float(np.radians(20.5))  # a DOF whose prior has a smaller sigma ne
 class ParameterLayout(Layout):
     """The one owner of the order of the parameters.
 
-    Names and groups ("lengths", "radii", "weights", "flesh": radii and weights, "shape": all) give indices in the shape vector (S,), as in
-    any `Layout`. The methods give columns of Jacobians:
+    Names and groups ("lengths", "radii", "weights", "flesh": radii and weights, "bends", "shape": all) give indices in the shape vector
+    (S,), as in any `Layout`. The methods give columns of Jacobians:
 
-        of one frame:    pose (D) | ln L (B) | ln l_x, ln l_z, ball by ball (2M) | ln w (M), where weights are free
+        of one frame:    pose (D) | ln L (B) | ln l_x, ln l_z, ball by ball (2M) | ln w (M), where weights are free | bends (H)
         of two frames:   pose of the first (D) | pose of the second (D) | shape (S)
     """
 
     def __init__(self, template: BodyShape, free_weights: bool) -> None:
         self.n_pose, self.n_bones, self.n_balls = len(template.skeleton.dofs), len(template.lengths_m), len(template.metaballs.weight)
-        self.free_weights = free_weights
+        self.free_weights, self.hands = free_weights, hands_of(template.skeleton)
         first_weight = self.n_bones + 2 * self.n_balls
         end = first_weight + (self.n_balls if free_weights else 0)
         groups = dict(
@@ -43,7 +46,8 @@ class ParameterLayout(Layout):
             radii=range(self.n_bones, first_weight),
             weights=range(first_weight, end),
             flesh=range(self.n_bones, end),
-            shape=range(end),
+            bends=range(end, end + len(self.hands)),
+            shape=range(end + len(self.hands)),
         )
         super().__init__(_names(template, free_weights), groups)
 
@@ -79,6 +83,10 @@ class ParameterLayout(Layout):
     def weights(self, balls: np.ndarray) -> np.ndarray:
         """The columns of the weights of some balls (K,), where weights are free."""
         return self.n_pose + self.n_bones + 2 * self.n_balls + balls
+
+    def bend(self, hand: int) -> int:
+        """The column of the bend of the fingers of a hand, a bone."""
+        return int(self.columns("bends")[self.hands.index(hand)])
 
     def split(self, columns: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Ascending columns (c,) of a Jacobian of one or two frames, as pose columns and indices of shape parameters."""
@@ -195,6 +203,7 @@ class BodyState:
     head_m: np.ndarray  # (B, 3) bone heads in the world
     axes: np.ndarray  # (D, 3) axes of the DOFs in the world
     find_profiles: Callable[[], Mapping[int, BoneProfile]]
+    finger_bends: Mapping[int, float]  # by the hand's bone
 
     @property
     def profiles(self) -> Mapping[int, BoneProfile]:
@@ -252,12 +261,13 @@ class BodyState:
 
 
 def shape_vector(state: BodyState) -> np.ndarray:
-    """(S,) of a body: ln of lengths and cross radii, and of weights where they are parameters."""
-    return _vector(state.lengths_m, state.balls, state.layout.free_weights)
+    """(S,) of a body: ln of lengths and cross radii, of weights where they are parameters, and bends."""
+    return _vector(state.lengths_m, state.balls, state.layout.free_weights, [*state.finger_bends.values()])
 
 
-def _vector(lengths_m: np.ndarray, balls: Metaballs, weights: bool) -> np.ndarray:
-    return np.log(np.concatenate([lengths_m, balls.radii_m[:, CROSS].ravel(), *([balls.weight] if weights else [])]))
+def _vector(lengths_m: np.ndarray, balls: Metaballs, weights: bool, bends: Sequence[float]) -> np.ndarray:
+    positive = [lengths_m, balls.radii_m[:, CROSS].ravel(), *([balls.weight] if weights else []), np.array(bends) + BACK]
+    return np.log(np.concatenate(positive))
 
 
 def free_bones(parameters: "ShapeParameters") -> np.ndarray:
@@ -283,7 +293,13 @@ class ShapeParameters:
     def vector(self, shape: BodyShape | None = None) -> np.ndarray:
         """The shape vector (S,) of a body (default: the template)."""
         shape = self.template if shape is None else shape
-        return _vector(shape.lengths_m, shape.metaballs, self.layout.free_weights)
+        names = [shape.skeleton.bones[b].name for b in self.layout.hands]
+        bends = [shape.finger_bends[name].value if name in shape.finger_bends else RELAXED for name in names]
+        return _vector(shape.lengths_m, shape.metaballs, self.layout.free_weights, bends)
+
+    def bends(self, vector: np.ndarray) -> dict[int, float]:
+        """The bends of the fingers of a shape vector, by the hand's bone."""
+        return dict(zip(self.layout.hands, np.minimum(np.exp(vector[self.layout.group("bends")]) - BACK, BENDS[1]).tolist()))
 
     def body(self, vector: np.ndarray) -> tuple[np.ndarray, Metaballs]:
         """Lengths (B,) [m] and balls of a shape vector; what is not estimated comes from the template. The last result is cached."""
@@ -301,8 +317,8 @@ class ShapeParameters:
         return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=weight)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (K,), (K,) of the parameters of left and right limbs that correspond by name."""
-        names = self.layout.names
+        """Indices (K,), (K,) of the lengths, radii and weights of left and right limbs that correspond by name."""
+        names = self.layout.names[: len(self.layout) - len(self.layout.hands)]
         right = [i for i, name in enumerate(names) if ".R" in name and name.replace(".R", ".L") in names]
         left = [self.layout[names[i].replace(".R", ".L")] for i in right]
         return np.array(left, dtype=np.intp), np.array(right, dtype=np.intp)
@@ -328,7 +344,7 @@ class ShapeParameters:
         return self._last_states[1]
 
     def _states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
-        lengths, balls = self.body(vector)
+        (lengths, balls), bends = self.body(vector), self.bends(vector)
         forward = frames_and_axes(self.skeleton, lengths, motion)
         return [
             BodyState(
@@ -342,6 +358,7 @@ class ShapeParameters:
                 axes=axes,
                 layout=self.layout,
                 find_profiles=partial(self.profiles, vector),
+                finger_bends=bends,
             )
             for m, R, head, axes in zip(motion, *forward)
         ]
@@ -361,7 +378,12 @@ class ShapeParameters:
             length_sigma_m=length_sigma,
             radius_sigma_m=radius_sigma,
             weight_sigma=sigma[self.layout.group("weights")] * balls.weight if self.layout.free_weights else None,
+            finger_bends=self._finger_bends(vector, sigma),
         )
+
+    def _finger_bends(self, vector: np.ndarray, sigma: np.ndarray) -> dict[str, FingerBend]:
+        own = zip(self.bends(vector).items(), sigma[self.layout.group("bends")].tolist())
+        return {self.skeleton.bones[b].name: FingerBend(bend, s * (bend + BACK)) for (b, bend), s in own}
 
 
 def _names(shape: BodyShape, weights: bool) -> list[str]:
@@ -370,7 +392,8 @@ def _names(shape: BodyShape, weights: bool) -> list[str]:
     for b in shape.metaballs.bone_index.tolist():
         count[b] += 1
         balls.append(f"{bones[b].name} {count[b]}")
-    return names + [f"radius {ball} {axis}" for ball in balls for axis in "xz"] + [f"weight {ball}" for ball in balls if weights]
+    names += [f"radius {ball} {axis}" for ball in balls for axis in "xz"] + [f"weight {ball}" for ball in balls if weights]
+    return names + [f"bend {bones[b].name}" for b in hands_of(shape.skeleton)]
 
 
 Block = tuple[np.ndarray, np.ndarray, np.ndarray]  # rows (n,), columns (c,) of D + S, values (n, c)

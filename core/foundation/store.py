@@ -145,7 +145,7 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
     except ValueError as error:
-        raise InputError(f"{path} is not a JSON file ({error}); remove it and run again.") from error
+        raise InputError(f"{path} is not a JSON file ({error}); mend it, or remove it and run again.") from error
 
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:

@@ -102,6 +102,12 @@ def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
     _check_sigmas(table[:, 2 + len(names) :], path)
     check_times(table[:, 0], 1.0, f"{path} has rows")
     d, factor = len(names), _to_file(skeleton, names)
+    known = np.isfinite(table[:, 2 : 2 + d])
+    if len(some := np.argwhere(~known & known.any(axis=1)[:, None])):
+        row, column = some[0]
+        raise InputError(
+            f"Row {row + 2} of {path} has no number in the column “{names[column]}”, but in others; give it one, or none to any."
+        )
     return MotionTable(
         frames=table[:, 0], time_s=table[:, 1], dof_names=names, values=table[:, 2 : 2 + d] / factor, sigma=table[:, 2 + d :] / factor
     )
@@ -181,13 +187,13 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     except PermissionError as error:
         raise InputError(f"Cannot read the table {path}: {error.strerror}; change its rights.") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read the table {path}: {damage_of(error)}; run the fit again.") from error
+        raise InputError(f"Cannot read the table {path}: {damage_of(error)}; mend it, or run the fit again.") from error
     if not lines:
-        raise InputError(f"The table {path} is empty; run the fit again.")
+        raise InputError(f"The table {path} is empty; mend it, or run the fit again.")
     header, rows = lines[0], [row for row in lines[1:] if row]
     for line, row in enumerate(rows, 2):
         if len(row) != len(header):
-            raise InputError(f"Row {line} of {path} has {len(row)} values, the header {len(header)}; run the fit again.")
+            raise InputError(f"Row {line} of {path} has {len(row)} values, the header {len(header)}; mend it, or run the fit again.")
     return header, rows
 
 
@@ -199,25 +205,25 @@ def _column(header: Sequence[str], name: str, path: Path) -> int:
 
 def _word(text: str, path: Path, line: int) -> str:
     if text not in ("", *KNOWN):
-        raise InputError(f"Row {line} of {path} has “{text[:40]}” for “known”, not {', '.join(KNOWN)}; run the fit again.")
+        raise InputError(f"Row {line} of {path} has “{text[:40]}” for “known”, not {', '.join(KNOWN)}; mend it, or run the fit again.")
     return text
 
 
 def _whole(text: str, path: Path, line: int) -> int:
     value = _number(text, path, line)
     if not abs(value) < LARGEST_FRAME:
-        raise InputError(f"Row {line} of {path} has the frame number {text[:40]}; run the fit again.")
+        raise InputError(f"Row {line} of {path} has the frame number {text[:40]}; mend it, or run the fit again.")
     return int(value)
 
 
 def _check_sigmas(sigma: np.ndarray, path: Path) -> None:
     if (sigma < 0).any():
-        raise InputError(f"{path} has a negative sigma ({sigma.min():g}), which no run writes; run the fit again.")
+        raise InputError(f"{path} has a negative sigma ({sigma.min():g}), which no run writes; mend it, or run the fit again.")
 
 
 def _number(text: str, path: Path, line: int) -> float:
     try:
         value = float(text)
     except ValueError as error:
-        raise InputError(f"Row {line} of {path} holds “{text[:40]}” where a number is needed; run the fit again.") from error
+        raise InputError(f"Row {line} of {path} holds “{text[:40]}” where a number is needed; mend it, or run the fit again.") from error
     return value

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..body.shape import LAST_LINE
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.lock import NAME, locked
@@ -221,7 +222,7 @@ def lost(folder: Path, run: Mapping[str, Any], among: Iterable[str] | None = Non
     """By stage, the results in a folder, all of them or those `among` some, that have fewer files or bytes than when run.json was written,
     or arrays (.npz) with another content. The run.json of earlier versions has no sizes to compare.
 
-    A table that somebody edited may have fewer bytes, if it still ends with a row of the last frame."""
+    A table or a body that somebody edited may have fewer bytes, if it still ends as it did."""
     then, found, last = run.get("files", {}), dict[str, list[str]](), run.get("frames", [0, 0])[1] - 1
     for stage, names in MADE_BY.items():
         known = [name for name in names if name in then and (among is None or name in among)]
@@ -255,15 +256,17 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 def _ends_with(path: Path, frame: int) -> bool:
-    """Whether a file is a table whose last row is of this frame, with as many columns as the first."""
-    if path.suffix != ".csv":
+    """Whether a file is a table whose last row is of this frame, with as many columns as the first, or a whole body.toml."""
+    if path.suffix not in (".csv", ".toml"):
         return False
     try:
+        if path.suffix == ".toml":
+            return bounded.text_of(path, bounded.TOML_BYTES).rstrip().endswith(f"\n{LAST_LINE}")
         with bounded.opened(path, bounded.TABLE_BYTES) as file:
             columns = file.readline(MOST_ROW).count(b",")
             file.seek(max(0, file.seek(0, os.SEEK_END) - MOST_ROW))
             last = file.read().replace(b"\r", b"").removesuffix(b"\n").rpartition(b"\n")[2]
-    except OSError:
+    except (OSError, ValueError):
         return False
     return last.startswith(f"{frame},".encode()) and last.count(b",") == columns
 

@@ -123,7 +123,7 @@ def run_take(take: str, out: str, overrides: Overrides, restart: bool) -> dict[s
     """The task of a worker: run one take like `tricap run`. Returns an Outcome as a table; the task fails only if the worker dies."""
     began = time.perf_counter()
     try:
-        with take_run.open_run(Path(take), Path(out), overrides, restart=restart) as job:
+        with take_run.open_run(Path(take), Path(out), overrides, restart=restart, spares=True) as job:
             if pipeline.is_complete(job):
                 job.record["warnings"] = job.results.read_run().get("warnings", [])
                 if not blend_file.is_whole(job.results.path(blend_file.BLEND)):

@@ -156,7 +156,7 @@ def open_run(
     restart: bool = False,
     for_contours: bool = False,
     needs_body: bool = False,
-    spares_body: bool = False,
+    spares: bool = False,
     pictures: Sequence[int] = (),
     clicked: Callable[[Take], Take] | None = None,
 ) -> Iterator[Run]:
@@ -165,8 +165,8 @@ def open_run(
     What an earlier run of other input left in OUT is removed (with `for_contours` surface and tracks alone: the files of a fit stay until
     the next one); `restart` removes it all. A body.blend that somebody edited, and an outline that was drawn on other images, get another
     name; `notes` has the sentences that say so, and so has an error that follows. `needs_body`: a body of the same input must be there, but
-    for its outlines. `spares_body`: one of another take, or of frames that are left out now, is not removed. `pictures`: the frames of the
-    report's, by default a few. `clicked`: gives the take with other clicks than its own.
+    for its outlines. `spares`: results of another take, or a body of frames that are left out now, are not removed. `pictures`: the frames
+    of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -188,8 +188,8 @@ def open_run(
         outlines, notes = _outlines(results, before, footage, digests, check=not for_contours)
         with _with_errors(notes):
             keys = _known(results, before, stage_keys(footage, settings, Path(out)), by_content)
-            if spares_body:
-                _check_body_not_replaced(results.folder, before, footage, keys)
+            if spares:
+                _check_not_replaced(results.folder, before, footage, keys)
             kept = _kept_stages(results, before, keys, for_contours=for_contours, needs_body=needs_body)
             record, incomplete = new_record(footage, settings) | {drawn_outlines.ENTRY: outlines}, lost(results.folder, before)
             record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
@@ -218,22 +218,23 @@ def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> Non
         )
 
 
-def _check_body_not_replaced(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
-    """Check that a finished body is not replaced by that of another take, or of other frames that lack some of its own.
+def _check_not_replaced(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
+    """Check that results are not replaced by those of another take, nor a finished body by that of frames that lack some of its own.
 
     Raises:
         InputError: it would be.
     """
     stages, take, now = before.get("stages", {}), footage.take, footage.frames
-    if "fit" not in stages or "not_done" in stages["fit"] or "measure" in valid_stages(before, keys):
+    if not stages or "measure" in valid_stages(before, keys):
         return
+    has_body = "fit" in stages and "not_done" not in stages["fit"]
     advice = "choose another folder for the results, or replace them with --restart."
     earlier, text = Path(before.get("take", "")), store.digest(take.folder / "take.toml")
     is_there, is_copy = (earlier / "take.toml").is_file(), before.get("inputs", {}).get("take.toml") == text
     if earlier != take.folder and is_there and not is_copy:  # a take that was moved is no longer there
-        raise InputError(f"{folder} has the fitted body of another take, {earlier}; {advice}")
+        raise InputError(f"{folder} has {'the fitted body' if has_body else 'results'} of another take, {earlier}; {advice}")
     first, end = before.get("frames", (now.start, now.stop))
-    if before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
+    if has_body and before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
         raise InputError(f"{folder} has the fitted body of the frames {first}:{end}; for {now.start}:{now.stop} {advice}")
 
 

@@ -79,8 +79,12 @@ def sound_of(samples: np.ndarray, rate: int) -> Sound:
     """
     from scipy.signal import resample_poly
 
-    if not LOWEST_RATE <= rate <= HIGHEST_RATE or len(samples) > LONGEST_S * rate:
-        raise InputError(f"A sound of {rate} samples per second and {len(samples) / max(rate, 1):.0f} s cannot be compared; shorten it.")
+    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+        raise InputError(
+            f"A sound of {rate} samples per second cannot be compared; save it with {LOWEST_RATE} to {HIGHEST_RATE}, such as 48000."
+        )
+    if len(samples) > LONGEST_S * rate:
+        raise InputError(f"A sound of {len(samples) / rate:.0f} s is too long to be compared; shorten it to {LONGEST_S:.0f} s.")
     mono = np.asarray(samples, dtype=np.float32)
     mono = mono if mono.ndim == 1 else mono.mean(axis=1)
     mono = np.nan_to_num(mono - (mono.mean() if len(mono) else 0.0))
@@ -99,7 +103,7 @@ def read_wav(path: Path) -> Sound:
             channels, width, rate, count = wav.getnchannels(), wav.getsampwidth(), wav.getframerate(), wav.getnframes()
             data = np.frombuffer(wav.readframes(count), dtype=np.uint8)
     except (OSError, EOFError, wave.Error, ValueError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or error or "it ends too early"
+        reason = getattr(error, "strerror", None) or str(error) or "it ends too early"
         raise InputError(f"Cannot read the sound {path} ({reason}); save it as WAV, 16 bits PCM.") from error
     if width not in (1, 2, 3, 4) or channels < 1:
         raise InputError(f"Cannot read the sound {path} ({8 * width} bits); save it as WAV, 16 bits PCM.")
@@ -110,7 +114,10 @@ def read_wav(path: Path) -> Sound:
         wide = np.zeros((*parts.shape[:2], 4), dtype=np.uint8)
         wide[..., 4 - width :] = parts
         values = (wide.view("<i4")[..., 0] / 2.0**31).astype(np.float32)
-    return sound_of(values, rate)
+    try:
+        return sound_of(values, rate)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def offset_between(a: Sound, b: Sound, monitor: Monitor) -> SoundOffset | None:

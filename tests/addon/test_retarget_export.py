@@ -140,6 +140,13 @@ def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
         assert export_file(out, "ply", tmp_path / f"of {of}", "plain", Monitor(), of=of) == f"1 files from {found}/"
         assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == (out / found / "0003.ply").read_bytes()
     shutil.copy(out / "clouds" / "0003.ply", out / "clouds" / "0009.ply")
+    (out / "cache").mkdir()  # what a killed run leaves
+    with pytest.raises(InputError, match="clouds is not finished: the run that makes it was stopped, or goes on"):
+        export_file(out, "ply", tmp_path / "of a part", "plain", Monitor(), of="clouds")
+    (out / "run.json").write_text(json.dumps({"format": FORMAT, "version": VERSION, "frames": [0, 4], "stages": {}}))
+    with pytest.raises(InputError, match="skin is not finished"):
+        export_file(out, "ply", tmp_path / "of a part", "plain", Monitor())
+    assert not (tmp_path / "of a part").exists()
     (out / "run.json").write_text(json.dumps({"format": FORMAT, "version": VERSION, "frames": [0, 4]}))
     assert export_file(out, "ply", tmp_path / "of the run", "plain", Monitor(), of="clouds") == "1 files from clouds/"
     (out / "clouds" / "0003.ply").write_bytes(b"ply\n, cut")
@@ -200,6 +207,18 @@ def test_a_file_whose_name_is_no_text_is_not_given_to_blender(empty: ModuleType,
     with pytest.raises(InputError, match="is not UTF-8; rename it"):
         write_whole(tmp_path / "a\udcff.fbx", lambda part: pytest.fail("the exporter was called"))
     assert not list(tmp_path.iterdir())
+
+
+def test_bones_whose_names_blender_would_cut_are_named(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    export_file(small_run.out, "bvh", tmp_path / "a.bvh", "plain", Monitor())
+    text = (tmp_path / "a.bvh").read_text()
+    for name, refused in (("x" * 63, False), ("x" * 64, True), (32 * "ä", True)):
+        (tmp_path / "b.bvh").write_text(text.replace("upper_arm.R", name), encoding="utf-8")
+        if refused:
+            with pytest.raises(InputError, match="has a longer name than Blender allows, 63 bytes; shorten it"):
+                export_file(tmp_path / "b.bvh", "glb", tmp_path / "b.glb", "plain", Monitor())
+        else:
+            export_file(tmp_path / "b.bvh", "glb", tmp_path / "b.glb", "plain", Monitor())
 
 
 def test_places_that_points_lack_are_said(small_run: SmallRun, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ cut, their vertices are those of a Catmull–Clark subdivision: the cut is follo
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -57,9 +58,9 @@ def _kind_of(shape: BodyShape, b: int) -> _Kind | None:
         return _Kind(head_template, y, NECK, -z, -x, _border_fitted)
     if not has_digits(shape, b):
         return None
-    return (
-        _Kind(hand_template, y, WRIST, x, -z, _palm_fitted) if name[:-2] == HAND else _Kind(foot_template, z, ANKLE, x, y, _border_fitted)
-    )
+    if name[:-2] != HAND:
+        return _Kind(foot_template, z, ANKLE, x, y, _border_fitted)
+    return _Kind(partial(hand_template, shape.finger_bend(name)), y, WRIST, x, -z, _palm_fitted)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

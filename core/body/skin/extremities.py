@@ -136,8 +136,10 @@ def person_shape(shape: BodyShape) -> BodyShape:
     }
     if not ends:
         return shape
-    profiles = bone_profiles(shape.skeleton, shape.lengths_m, shape.metaballs, chain_neighbours(shape))
-    made = [_placed(shape, b, end, _fitted(shape, b, end, profiles[b])) for b, end in ends.items()]
+    profiles, bones = bone_profiles(shape.skeleton, shape.lengths_m, shape.metaballs, chain_neighbours(shape)), shape.skeleton.bones
+    in_units = {b: shape.has_measured_fingers(bones[b].name) for b in ends}  # measured fingers are those of a hand of the bone's length
+    found = {b: np.zeros(4) if in_units[b] else _fitted(shape, b, end, profiles[b]) for b, end in ends.items()}
+    made = [_placed(shape, b, end, found[b]) for b, end in ends.items()]
     kept = ~np.isin(shape.metaballs.bone_index, list(ends))
     slender = _slender_neck(shape)
     balls = Metaballs(

@@ -74,12 +74,12 @@ _Bones = tuple[list[str], np.ndarray, np.ndarray]  # names, joints (n + 1, 3) [m
 
 
 def _finger_chains(shape: BodyShape, b: int) -> list[_Bones]:
-    scale, side, found = placement(shape, b).scale, shape.skeleton.bones[b].name[-2:], []
+    scale, name, found = placement(shape, b).scale, shape.skeleton.bones[b].name, []
     for finger in (THUMB, *FINGERS):
-        frames = finger_frames(finger)
+        frames = finger_frames(finger, shape.finger_bend(name))
         joints = np.concatenate([np.zeros((1, 3)), frames.joints]) * scale
         flexes_to = np.concatenate([[[0.0, 0.0, 1.0]], frames.axes[:, :, 2]]) * np.sign(scale)
-        found.append(([palm_bone(finger.name, side), *(f"{finger.name}.0{k}{side}" for k in (1, 2, 3))], joints, flexes_to))
+        found.append(([palm_bone(finger.name, name[-2:]), *(f"{finger.name}.0{k}{name[-2:]}" for k in (1, 2, 3))], joints, flexes_to))
     return found
 
 

@@ -67,18 +67,20 @@ THENAR = np.array(
     ]
 )
 DEPTH = 0.90  # of a finger over its breadth
+RELAXED = 1.0  # the bend of the fingers of a relaxed hand; 0: straight, 2: half closed
+BENDS = (-0.25, 8.0)  # between fingers that are bent back and a fist
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FingerFrames:
-    """The rest pose of a finger: joints (4, 3), the tip last, and its bones' axes (3, 3, 3), columns, y along and z where it flexes to."""
+    """A pose of a finger: joints (4, 3), the tip last, and its bones' axes (3, 3, 3), columns, y along and z where it flexes to."""
 
     joints: np.ndarray
     axes: np.ndarray
 
 
-def finger_frames(finger: Finger) -> FingerFrames:
-    """Where the bones of a finger are in the relaxed pose."""
+def finger_frames(finger: Finger, bend: float = RELAXED) -> FingerFrames:
+    """Where the bones of a finger are when its joints are bent `bend` times as far as in the relaxed pose."""
     if finger is THUMB:
         y = np.array(THUMB_ALONG) / np.linalg.norm(THUMB_ALONG)
         z = np.array(THUMB_FLEXES_TO) - (np.array(THUMB_FLEXES_TO) @ y) * y
@@ -88,8 +90,8 @@ def finger_frames(finger: Finger) -> FingerFrames:
         a = np.radians(-finger.spread_deg)
         R = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
     joints, axes = [np.array(finger.base)], []
-    for length, bend in zip(finger.lengths_mm, np.radians(finger.bends_deg)):
-        R = R @ np.array([[1, 0, 0], [0, np.cos(bend), -np.sin(bend)], [0, np.sin(bend), np.cos(bend)]])
+    for length, angle in zip(finger.lengths_mm, bend * np.radians(finger.bends_deg)):
+        R = R @ np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
         axes.append(R)
         joints.append(joints[-1] + length / UNIT_MM * R[:, 1])
     return FingerFrames(np.stack(joints), np.stack(axes))
@@ -172,9 +174,10 @@ def _ring(centre: np.ndarray, axes: np.ndarray, radius: float, around: np.ndarra
     return np.asarray(centre + radius * (around[:, :1] * axes[:, 0] + DEPTH * around[:, 1:] * axes[:, 2]))
 
 
-def _grow(cage: _Cage, finger: Finger, root: np.ndarray, first: float, left: float, bottom: float) -> tuple[float, float]:
+def _grow(cage: _Cage, finger: Finger, bend: float, root: np.ndarray, first: float, left: float, bottom: float) -> tuple[float, float]:
     """The finger beyond its first ring `root` (8,), which is at `first` along it; returns width and height of its texture."""
-    centres, axes, along, owners = _finger_stations(finger_frames(finger), first)
+    frames = finger_frames(finger, bend)
+    centres, axes, along, owners = _finger_stations(frames, first)
     rings = [root]
     for centre, turn, radius, (k, shared) in zip(centres, axes, _radius(finger, along), owners):
         own = cage.share(**{f"{finger.name}.0{k + 1}": 1.0})
@@ -186,8 +189,8 @@ def _grow(cage: _Cage, finger: Finger, root: np.ndarray, first: float, left: flo
     u = left + width * np.arange(9) / 8
     v = bottom + np.concatenate([[first], along])
     cage.tube(np.stack(rings), u, v - first)
-    last, tip = rings[-1], finger_frames(finger)
-    pole = cage.added((tip.joints[3] + 0.012 * tip.axes[2][:, 1])[None], cage.share(**{f"{finger.name}.03": 1.0}))[0]
+    last = rings[-1]
+    pole = cage.added((frames.joints[3] + 0.012 * frames.axes[2][:, 1])[None], cage.share(**{f"{finger.name}.03": 1.0}))[0]
     high = float(v[-1] - first + 0.02)
     half = 0.5 * width / 4
     square = np.array([[1, -1], [0, -1], [-1, -1], [-1, 0], [-1, 1], [0, 1], [1, 1], [1, 0], [0, 0]])  # the last ring and the tip
@@ -203,11 +206,11 @@ def _start_ring() -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angle), -np.sin(angle)
 
 
-def _row_at_fingers(along: float, thick: tuple[float, float] | None) -> np.ndarray:
+def _row_at_fingers(along: float, thick: tuple[float, float] | None, bend: float) -> np.ndarray:
     """(RING, 3): a row of the palm at a fraction of the fingers' first bones; `thick`: half thicknesses, by default the fingers' own."""
     ring = np.empty((RING, 3))
     for i, finger in enumerate(FINGERS):
-        frames = finger_frames(finger)
+        frames = finger_frames(finger, bend)
         s = along * finger.lengths_mm[0] / UNIT_MM
         turn = _between(np.eye(3), frames.axes[0]) if along == 0 else frames.axes[0]
         centre, breadth = frames.joints[0] + s * frames.axes[0][:, 1], FULLER * finger.radii_mm[0] / UNIT_MM
@@ -226,10 +229,10 @@ def _row_at_fingers(along: float, thick: tuple[float, float] | None) -> np.ndarr
     return ring
 
 
-def _palm(cage: _Cage) -> list[np.ndarray]:
+def _palm(cage: _Cage, bend: float) -> list[np.ndarray]:
     """Rows (RING,) of the palm's tube from the wrist to the webs, without its quads."""
     u, v = _start_ring()
-    knuckles = _row_at_fingers(0.0, KNUCKLE)
+    knuckles = _row_at_fingers(0.0, KNUCKLE, bend)
     middle, width = (knuckles[:, 0].max() + knuckles[:, 0].min()) / 2, np.ptp(knuckles[:, 0]) / 2
     u_end, v_end = (knuckles[:, 0] - middle) / width, knuckles[:, 2] / np.where(knuckles[:, 2] < 0, *KNUCKLE) / FULLER
     y_end = knuckles[:, 1] - knuckles[:, 1].mean()
@@ -241,7 +244,7 @@ def _palm(cage: _Cage) -> list[np.ndarray]:
         places[[1, 0, RING - 1, RING - 2, RING - 3]] += THENAR[len(rows)] @ [[1.0, 0, 0], [0, 0, 1.0]]
         rows.append(cage.added(places, _of_fingers(cage, FOLLOWING[0]) if y == PALM[-1, 0] else cage.share()))
     for along, thick, own in zip((0.0, 0.5 * WEB, WEB), (KNUCKLE, BEYOND, None), FOLLOWING[1:]):
-        rows.append(cage.added(_row_at_fingers(along, thick), _of_fingers(cage, own)))
+        rows.append(cage.added(_row_at_fingers(along, thick, bend), _of_fingers(cage, own)))
     return rows
 
 
@@ -255,11 +258,11 @@ def _of_fingers(cage: _Cage, own: float) -> np.ndarray:
     return shares
 
 
-@lru_cache(maxsize=1)
-def hand_template() -> Template:
-    """The cage of the right hand."""
+@lru_cache(maxsize=4)
+def hand_template(bend: float = RELAXED) -> Template:
+    """The cage of the right hand, with fingers bent as in `finger_frames`."""
     cage = _Cage()
-    rows = _palm(cage)
+    rows = _palm(cage, bend)
     lead, mid, end = THUMB_ROWS
     out = np.zeros((len(rows) - 1, RING), dtype=bool)
     out[np.ix_([lead, mid], [0, RING - 1])] = True
@@ -271,7 +274,7 @@ def hand_template() -> Template:
     web, back, palm = rows[-1], 1, RING - 1
     inner = {0: web[0], COLUMNS - 1: web[COLUMNS + 1]}  # the middle row of the wall at the webs, by column
     for i, finger in enumerate(FINGERS):
-        frames, s = finger_frames(finger), WEB * finger.lengths_mm[0] / UNIT_MM
+        frames, s = finger_frames(finger, bend), WEB * finger.lengths_mm[0] / UNIT_MM
         ring = _ring(frames.joints[0] + s * frames.axes[0][:, 1], frames.axes[0], FULLER * finger.radii_mm[0] / UNIT_MM, AROUND)
         for column, corner in ((3 * i, 7), (3 * i + 2, 3)):
             if column not in inner:
@@ -281,7 +284,7 @@ def hand_template() -> Template:
     for i, finger in enumerate(FINGERS):
         a = 3 * i
         root = np.array([*web[back + a : back + a + 3], inner[a + 2], web[palm - a - 2], web[palm - a - 1], web[palm - a], inner[a]])
-        width, height = _grow(cage, finger, root, WEB * finger.lengths_mm[0] / UNIT_MM, left, above)
+        width, height = _grow(cage, finger, bend, root, WEB * finger.lengths_mm[0] / UNIT_MM, left, above)
         heights.append(height)
         if i < len(FINGERS) - 1:
             c = a + 2
@@ -293,7 +296,7 @@ def hand_template() -> Template:
         left += width + 0.03
     thumb, back_of, palm_of = (np.array([row[column] for row in (rows[lead], rows[mid], rows[end])]) for column in (0, 1, RING - 1))
     root = np.array([thumb[0], *back_of, thumb[2], *palm_of[::-1]])
-    width, height = _grow(cage, THUMB, root, 0.28, left, above)
+    width, height = _grow(cage, THUMB, bend, root, 0.28, left, above)
     faces = np.concatenate(cage.faces)
     places = _faired(np.concatenate(cage.places), faces, root)
     weights = np.concatenate(cage.shares).copy()

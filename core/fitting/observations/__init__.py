@@ -9,6 +9,7 @@ import numpy as np
 
 from ..state import Block, BodyState, FromBlocks
 from .background import BackgroundExclusion
+from .hand_points import HandPoints
 from .joints import ClickedJoints, FootOnFloor, Keypoints
 from .material_step import ImageSteps, MaterialSteps, Steps, StepsFromFixed
 from .pose_priors import JointLimits, PosePrior
@@ -25,6 +26,7 @@ __all__ = [
     "EqualRadii",
     "FootOnFloor",
     "FromBlocks",
+    "HandPoints",
     "ImageSteps",
     "JointLimits",
     "Keypoints",

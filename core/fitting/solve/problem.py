@@ -54,17 +54,22 @@ def variance_factor(x: np.ndarray, kind: str, width: float) -> float:
     return float(np.clip(np.mean((w * x) ** 2) * np.mean(w) / mean_slope**2, *FACTOR_RANGE))
 
 
-LARGEST_SCALE = {"contours": 1.0}  # outlines are few: a body too thin all around would pass for their noise, and stay thin
+LARGEST_SCALE = {
+    "contours": 1.0,  # outlines are few: a body too thin all around would pass for their noise, and stay thin
+    "hands": 1.0,  # a hand that is still turned would pass for theirs, and stay turned
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Robust standard deviations of unit-weight residuals, kind by kind: measured points (sigma0), tracked points, contours, keypoints."""
+    """Robust standard deviations of unit-weight residuals, kind by kind: measured points (sigma0), tracked points, contours, keypoints,
+    points of hands."""
 
     points: float = 1.0
     steps: float = 1.0
     contours: float = 1.0
     keypoints: float = 1.0
+    hands: float = 1.0
 
     def of(self, kind: str) -> float:
         """The scale of a kind."""

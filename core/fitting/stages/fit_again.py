@@ -21,6 +21,7 @@ from ...body.motion import BodyMotion
 from ...body.shape import BodyShape
 from ...foundation.progress import Monitor
 from ..context import NO_SHAPE, FitContext
+from ..hands import BACK
 from ..inputs.clicks import Clicks
 from ..inputs.cloud_points import thinned
 from ..inputs.fit_input import FitInput
@@ -198,6 +199,8 @@ def _shape_covariance(fit: FitContext, shape: BodyShape) -> np.ndarray:
     at, sigma = fit.parameters.layout, np.zeros(len(fit.parameters.layout))
     sigma[at.group("lengths")] = shape.length_sigma_m / shape.lengths_m
     sigma[at.group("radii")] = (shape.radius_sigma_m / shape.metaballs.radii_m)[:, [0, 2]].ravel()
+    bends = [shape.finger_bends.get(shape.skeleton.bones[b].name) for b in at.hands]
+    sigma[at.group("bends")] = [0.0 if bend is None else bend.sigma / (bend.value + BACK) for bend in bends]
     return np.diag(np.nan_to_num(sigma) ** 2)
 
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..context import FitContext
+from ..hands import REACH
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import PointTracks
 from ..limb import Limb, whole_limbs
@@ -168,7 +169,10 @@ def joined(parts: list[FrameResults]) -> FrameResults:
 
 def near(points: CloudPoints, state: BodyState) -> CloudPoints:
     """The points that the adjustment of a body near this state can ever need."""
-    return crop(points, state, REACH_M)
+    reach = np.full(len(state.lengths_m), REACH_M)
+    hands = list(state.layout.hands)
+    reach[hands] += (REACH - 1) * state.lengths_m[hands]  # with their fingers
+    return crop(points, state, reach)
 
 
 def sample(frames: int, click: int) -> list[int]:

@@ -322,7 +322,7 @@ def whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Probl
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [
-            *fit.surface_observations(t, points[t], state, cache=cache),
+            *fit.with_fingers(t, points[t], state, cache=cache),
             *fit.joints(t),
             *fit.background.observe(t),
             *priors[t],
@@ -331,10 +331,11 @@ def whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Probl
         ]
 
     coupling = Coupling(acceleration=Acceleration(time_s=part.time_s, sigma=part.sigma), prior=prior)
+    weight = _shared_weight(points, fit.settings)
     return replace(
         fit.problem(observe, "shape", coupling),
-        shape_observations=fit.shape_observations(part.lengths),
-        shape_weight=_shared_weight(points, fit.settings),
+        shape_observations=fit.shape_observations(part.lengths, weight),
+        shape_weight=weight,
         observe_step=None if part.tracks is None else part.tracks.steps,
     )
 
@@ -422,7 +423,9 @@ def _factors(part: Recording, problem: Problem, solution: Solution) -> Scales:
     found = variance_factors(problem, solution)
     own = [p.sigma_m for p in part.points if len(p.sigma_m)]
     wider = _correlated(part.fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
-    return replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)
+    return replace(
+        found, points=wider * found.points, contours=wider * found.contours, hands=wider * found.hands, steps=wider * found.steps
+    )
 
 
 def _correlated(settings: FitSettings, own_m: float) -> float:

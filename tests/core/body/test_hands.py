@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.body.shape import BodyShape, default_shape
+from tricap.core.body.shape import BodyShape, FingerBend, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.closed_skin import OneSkin, flipped, one_skin
 from tricap.core.body.skin.ends import row_counts, row_of_quads
@@ -88,6 +88,24 @@ def test_a_skin_with_fingers_is_closed_and_no_quad_is_flipped() -> None:
     assert mesh.uv.min() >= 0 and mesh.uv.max() <= 1
     fingers = {name for name in names() if FINGER_BONE.fullmatch(name)}
     assert len(fingers) == 30 and all((mesh.weights[:, names().index(name)] > 0.6).sum() > 20 for name in fingers)
+
+
+@pytest.mark.parametrize("bend", [-0.2, 0.0, 3.0])
+def test_measured_fingers_are_bent_as_far_in_skin_and_bones(bend: float) -> None:
+    """With the same quads, closed, and none flipped; the other hand is relaxed."""
+    body = replace(default_shape(read_model("upper_body")), finger_bends={"hand.R": FingerBend(bend, 0.1)})
+    shape = shape_for_skin(body, SkinSettings())
+    mesh, bones = one_skin(shape, SkinSettings()), [bone.name for bone in shape.skeleton.bones]
+    once = one_skin(person(), SkinSettings())
+    assert np.array_equal(mesh.faces, once.faces) and not flipped(mesh.vertices_m, mesh.faces).any()
+    R = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))[0][:, :, 1]
+    for side, times in (("R", bend), ("L", 1.0)):
+        for finger in FINGERS:
+            along = [R[bones.index(f"{finger.name}.0{k}.{side}")] for k in (1, 2, 3)]
+            angles = [np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a, b in zip(along, along[1:])]
+            np.testing.assert_allclose(angles, abs(times) * np.array(finger.bends_deg[1:]), atol=0.5)
+    moved = np.linalg.norm(mesh.vertices_m - once.vertices_m, axis=1)
+    assert moved[of_finger(once.weights, "f_middle.03.R")].min() > 0.003 and moved[of_finger(once.weights, "f_middle.03.L")].max() < 1e-9
 
 
 def test_left_and_right_hands_are_mirror_images() -> None:

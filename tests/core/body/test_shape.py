@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import model_files, model_names, read_model
-from tricap.core.body.shape import default_shape, read_body, write_body
+from tricap.core.body.shape import FingerBend, default_shape, read_body, write_body
 from tricap.core.foundation.errors import InputError
 
 
@@ -37,6 +37,23 @@ def test_weights_that_were_fitted_keep_their_sigmas(tmp_path: Path) -> None:
     (tmp_path / "body.toml").write_text(text.replace("weight_sigma = 0.0\n", ""))
     with pytest.raises(InputError, match="weight_sigma"):
         read_body(tmp_path / "body.toml")
+
+
+def test_measured_fingers_come_back_and_fists_have_a_limit(tmp_path: Path) -> None:
+    shape, path = default_shape(read_model("upper_body")), tmp_path / "body.toml"
+    write_body(path, replace(shape, finger_bends={"hand.L": FingerBend(0.25, 0.1), "hand.R": FingerBend(1.5, 0.9)}))
+    again = read_body(path)
+    assert again.finger_bends == {"hand.L": (0.25, 0.1), "hand.R": (1.5, 0.9)} and (
+        again.finger_bend("hand.L"),
+        again.finger_bend("hand.R"),
+    ) == (0.25, 1.0)
+    text = path.read_text()
+    path.write_text(text.replace("finger_bend_sigma = 0.1\n", ""))
+    assert np.isnan(read_body(path).finger_bends["hand.L"].sigma)
+    for wrong in ("9.0", "-0.25", "nan", '"much"'):
+        path.write_text(text.replace("finger_bend = 0.25", f"finger_bend = {wrong}"))
+        with pytest.raises(InputError, match="run the fit again"):
+            read_body(path)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.contour_skin import body_skin, limb_skin
-from tricap.core.fitting.hands import hand_capsules
+from tricap.core.fitting.hands import Fingers, hand_capsules
 from tricap.core.fitting.inputs.fit_input import ViewContours
+from tricap.core.fitting.state import BodyState
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import rasterize
 from tricap.core.geometry.rig import Rig
@@ -45,6 +46,20 @@ def hand_places(shape: BodyShape, pose: np.ndarray, name: str) -> tuple[np.ndarr
     share = np.linspace(0, 1, 12)[:, None, None]
     along = ((1 - share) * ends[:, 0] + share * ends[:, 1]).reshape(-1, 3)
     return head[b] + along @ R[b].T, ((1 - share[..., 0]) * radii[:, 0] + share[..., 0] * radii[:, 1]).ravel()
+
+
+def points_on_hand(state: BodyState, name: str, count: int = 90) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) on the back of a hand and of its fingers, with their normals, as cameras at one side see them."""
+    b = [bone.name for bone in state.skeleton.bones].index(name)
+    rng, fingers = np.random.default_rng(4), Fingers.bent(name.endswith(".L"), state.finger_bends[b])
+    k = rng.integers(0, len(fingers.length), 4 * count)
+    share, turn = rng.uniform(0, 1, len(k)), rng.normal(size=(len(k), 3))
+    turn -= np.einsum("ni,ni->n", turn, fingers.axis[k])[:, None] * fingers.axis[k]
+    turn *= -np.sign(turn[:, 2:]) / np.linalg.norm(turn, axis=1)[:, None]
+    radius = (1 - share) * fingers.radii[k, 0] + share * fingers.radii[k, 1]
+    places = fingers.first[k] + (share * fingers.length[k])[:, None] * fingers.axis[k] + radius[:, None] * turn
+    outside = np.flatnonzero(np.abs(fingers.gaps(places)[0]) < 0.03)[:count]  # not within another capsule
+    return state.head_m[b] + state.lengths_m[b] * places[outside] @ state.R[b].T, turn[outside] @ state.R[b].T
 
 
 def person_seen(camera: Camera, shape: BodyShape, pose: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from tricap.core.fitting.observations import (
     ClickedJoints,
     EqualRadii,
     FootOnFloor,
+    HandPoints,
     ImageSteps,
     JointLimits,
     Keypoints,
@@ -73,6 +74,7 @@ def _cases(parameters: ShapeParameters, state, rng):
         _empty(camera, joints, rng),
         _rays(state, near, bone, sigma, rng),
         Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=np.array([0.015, 0.03])),
+        *_on_hands(state, rng),
     ]
 
 
@@ -110,6 +112,14 @@ def _collisions(state, rng):
         radius_m=rng.uniform(0.5, 1.0, 6),
         sigma_m=0.01,
     )
+
+
+def _on_hands(state, rng) -> list[HandPoints]:
+    """Points around each hand as far as its fingers reach."""
+    bone = np.repeat(np.array(state.layout.hands, dtype=int), 40)
+    local = rng.uniform([-0.6, 0.1, -0.3], [0.6, 2.0, 0.5], (len(bone), 3)) * state.lengths_m[bone, None]
+    xyz = state.head_m[bone] + np.einsum("nij,nj->ni", state.R[bone], local)
+    return [HandPoints(xyz_m=xyz, bone=bone, sigma_m=rng.uniform(0.001, 0.005, len(bone)), variance_inflation=2.0)] if len(bone) else []
 
 
 def _empty(camera: Camera, joints: int, rng) -> BackgroundExclusion:
@@ -251,6 +261,7 @@ def test_the_layout_gives_every_parameter_its_own_column(weights: bool) -> None:
     layout = _parameters("full", weights).layout
     bones, balls = np.arange(layout.n_bones), np.arange(layout.n_balls)
     parts = [np.arange(layout.n_pose), layout.lengths(bones), layout.radii(balls).ravel(), *([layout.weights(balls)] if weights else [])]
+    parts.append(np.array([layout.bend(b) for b in layout.hands]))
     assert np.array_equal(np.concatenate(parts), np.arange(layout.size()))
     assert layout.size(shape=False) == layout.n_pose and layout.size() == layout.n_pose + len(layout)
     for group, columns in (("lengths", parts[1]), ("radii", parts[2]), ("shape", np.concatenate(parts[1:]))):

@@ -15,7 +15,8 @@ from tricap.core.fitting.inputs.background import UNIT_PX
 from tricap.core.fitting.inputs.cloud_points import CloudPoints
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, Packed
 from tricap.core.fitting.limb import Limb, limbs_of, whole_limbs
-from tricap.core.fitting.observations import PosePrior
+from tricap.core.fitting.observations import HandPoints, PosePrior
+from tricap.core.fitting.segmentation import SegmentationCache, surface_points
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Scales
 from tricap.core.fitting.solve.solver import Solution
@@ -25,7 +26,7 @@ from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.stages.turned_hands import angles_of_hands, priors_at, turn_hands
 from tricap.core.foundation.progress import Monitor
 
-from .limb_scene import front_rig, hand_places, measured_cloud, person_seen
+from .limb_scene import front_rig, hand_places, measured_cloud, person_seen, points_on_hand
 
 STEP_PX, FRAMES = 4, 6
 SHAPE = default_shape(read_model("full"))
@@ -133,6 +134,27 @@ def _given_without_background() -> FitInput:
     clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
     clouds = [measured_cloud(SHAPE, _pose(TRUE), 0, np.random.default_rng(0), points=200, noise=0.001, gross=0.0)]
     return FitInput(rig=rig, model="full", clouds=clouds, time_s=np.zeros(1), clicks={0: clicks})
+
+
+def test_points_of_hands_are_on_fingers_where_hands_were_looked_for(tracking) -> None:
+    """On metaballs elsewhere, where a hand has fewer points than `min_points`, and where its forearm is not seen."""
+    fit, pose = tracking.fit, _pose(TRUE)
+    state = fit.parameters.state(pose, tracking.first.vector)
+    xyz, normals = points_on_hand(state, "hand.R", 60)
+    hand = CloudPoints(frame=0, xyz_m=xyz, normals=normals, sigma_m=np.full(len(xyz), 1e-3))
+    body, forearm = surface_points(state), int(SHAPE.skeleton.parents[HAND])
+    arm = body[np.linalg.norm(body - state.head_m[forearm] - 0.4 * state.lengths_m[forearm] * state.R[forearm][:, 1], axis=1) < 0.1]
+    both = np.concatenate([arm, xyz])
+    points = CloudPoints(frame=0, xyz_m=both, normals=np.zeros_like(both), sigma_m=np.full(len(both), 1e-3))
+    plain = fit.with_fingers(0, points, state)
+    assert not any(isinstance(o, HandPoints) for o in plain) and HAND in plain[0].bone
+    looked, cache = replace(fit, turned=angles_of_hands(fit, np.tile(pose, (FRAMES, 1)))), SegmentationCache()
+    for _ in range(2):  # the second time from the cache
+        surface, hands = looked.with_fingers(0, points, state, cache)[:2]
+        assert HAND not in surface.bone and forearm in surface.bone and hands.size > 50 and set(hands.bone.tolist()) == {HAND}
+    for few in (points.take(np.arange(len(arm) + fit.settings.min_points - 1)), hand):
+        surface, hands = looked.with_fingers(0, few, state)[:2]
+        assert HAND in surface.bone and not hands.size
 
 
 def test_the_place_of_a_hand_is_that_against_its_arm(tracking) -> None:

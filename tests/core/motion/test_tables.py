@@ -117,6 +117,21 @@ def test_a_word_for_a_number_is_refused(tmp_path: Path) -> None:
         read_motion(tmp_path / "missing.csv", skeleton)
 
 
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_one_cell_without_a_number_is_refused_and_a_row_of_them_is_not(tmp_path: Path, value: str) -> None:
+    """A frame that nothing shows has none at all; to fill the other cells, too, would change what was measured."""
+    skeleton, path = read_model("arm.R").skeleton, tmp_path / "motion.csv"
+    write_motion(path, _motion(), skeleton)
+    lines = path.read_text().splitlines()
+    cells = lines[2].split(",")
+    path.write_text("\n".join([*lines[:2], ",".join([*cells[:3], value, *cells[4:]]), *lines[3:]]))
+    with pytest.raises(InputError, match=rf"^Row 3 of .* has no number in the column “{skeleton.dof_names[1]}”"):
+        read_motion(path, skeleton)
+    d = len(skeleton.dof_names)
+    path.write_text("\n".join([*lines[:2], ",".join([*cells[:2], *d * [value], *cells[2 + d :]]), *lines[3:]]))
+    assert not np.isfinite(read_motion(path, skeleton).values[1]).any()
+
+
 def test_a_negative_sigma_is_refused(tmp_path: Path) -> None:
     skeleton, motion = read_model("arm.R").skeleton, _motion()
     write_motion(tmp_path / "motion.csv", motion, skeleton)

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import body_text, default_shape
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import read_ply
@@ -204,6 +206,10 @@ def test_what_was_written_and_is_gone_or_cut_is_known(tmp_path: Path) -> None:
     for kept, complete in ((rows, True), (rows[:-1], False), ([*rows[:-1], "2,1"], True), ([*rows[:-1], "2\r\n"], False), ([], False)):
         (tmp_path / "joints.csv").write_text("".join(kept), newline="")
         assert ("joints.csv" not in lost(tmp_path, run)["fit"]) == complete, "an edited table may be shorter, a cut one may not"
+    run["files"]["body.toml"], whole = [1, 10_000], body_text(default_shape(read_model("arm.R")))
+    for text, complete in ((whole, True), (whole + "\n", True), (whole[: len(whole) // 2], False), (whole.removesuffix("# end\n"), False)):
+        (tmp_path / "body.toml").write_text(text)
+        assert ("body.toml" not in lost(tmp_path, run)["fit"]) == complete, "nor a body"
     for size in (3, [1], ["1", 2], [1, 2.5]):
         store.write_json(tmp_path / "run.json", {**run, "files": {"clouds": size}})
         with pytest.raises(InputError, match="“files” is invalid"):

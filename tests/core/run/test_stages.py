@@ -281,14 +281,29 @@ def test_a_fitted_body_is_not_replaced_by_that_of_another_take_or_of_fewer_frame
     ):
         assert main.main(["measure", str(take), "--out", str(out), "--frames", frames, *given]) == 2
         assert said in capfd.readouterr().err and files == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    with take_run.open_run(plane_take, out, {"growing": {"spacing_px": 16}}, (0, 4), spares_body=True):
+    with take_run.open_run(plane_take, out, {"growing": {"spacing_px": 16}}, (0, 4), spares=True):
         pass  # more frames are no loss
     assert main.main(["measure", str(another), "--out", str(out), "--frames", "0:2", "--restart", *given]) == 0
 
 
+def test_results_of_another_take_are_kept_without_a_body_too(plane_take: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """By single stages and by a batch whose takes have the same name."""
+    out, given = tmp_path / "out" / "t", ["--set", "growing.spacing_px=16", "--set", "frames=[0, 2]"]
+    one, other = (Path(shutil.copytree(plane_take, tmp_path / name / "t")) for name in "ab")
+    (other / "take.toml").write_text((other / "take.toml").read_text() + "\n# other\n")
+    other_picture(other / "L" / "0001.png")
+    assert main.main(["batch", str(one), "--out", str(tmp_path / "out"), "--workers", "1", *given[:2]]) == 0
+    clouds = {path: path.read_bytes() for path in (out / "clouds").iterdir()}
+    assert main.main(["measure", str(other), "--out", str(out), *given[:2]]) == 2
+    assert "has results of another take" in capfd.readouterr().err
+    assert main.main(["batch", str(other), "--out", str(tmp_path / "out"), "--workers", "1", *given[:2]]) != 0
+    assert "has results of another take" in "".join(capfd.readouterr())
+    assert clouds == {path: path.read_bytes() for path in (out / "clouds").iterdir()}
+
+
 def test_a_run_without_a_body_is_replaced_without_a_question(plane_take: Path, tmp_path: Path) -> None:
     pipeline.run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, frames=(0, 3))
-    with take_run.open_run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, (0, 2), spares_body=True) as again:
+    with take_run.open_run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, (0, 2), spares=True) as again:
         assert not again.record["stages"]
 
 
