@@ -6,13 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tricap.core.body.complete import complete_shape
 from tricap.core.body.model_file import read_model
-from tricap.core.body.shape import default_shape
+from tricap.core.body.shape import FingerBend, default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import JointLimits, PosePrior
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.stages.fit_again import HELD, EarlierFit, _about_earlier, around, fit_again, limbs_with, with_held
+from tricap.core.fitting.stages.fit_again import (
+    HELD,
+    EarlierFit,
+    _about_earlier,
+    _shape_covariance,
+    around,
+    fit_again,
+    limbs_with,
+    with_held,
+)
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.foundation.progress import Cancelled, Monitor
 
@@ -106,3 +116,14 @@ def test_what_the_fit_does_not_measure_stays_as_it_was() -> None:
     np.testing.assert_allclose(_about_earlier(prior, before).mean, [0.11, 0.0])
     limits = JointLimits(low=np.zeros(2), high=np.ones(2), sigma=1.0)
     assert _about_earlier(limits, before) is limits
+
+
+def test_bent_fingers_are_as_uncertain_as_body_toml_says() -> None:
+    """Also in the complete model, which keeps the bends of the simplified one."""
+    simple = replace(default_shape(read_model("full")), finger_bends={"hand.R": FingerBend(0.3, 0.11)})
+    for shape in (simple, complete_shape(simple)):
+        parameters = ShapeParameters(shape)
+        right, left = (parameters.layout[f"bend hand.{side}"] for side in "RL")
+        sigma = np.sqrt(np.diag(_shape_covariance(SimpleNamespace(parameters=parameters), shape)))
+        assert (sigma[right], sigma[left]) == (pytest.approx(0.11 / 0.55), 0.0)
+        np.testing.assert_allclose([*parameters.bends(parameters.vector()).values()], [0.3, 1.0])
