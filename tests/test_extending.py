@@ -83,7 +83,7 @@ def test_the_observation_moves_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={0: scene.clicks}, click_frame=0, time_s=scene.time_s)
     free = fit_sequence(given).shape.lengths_m[1]
     tape = taped(bone=1, tape_m=1.08 * free, sigma_m=1e-4)
-    monkeypatch.setattr(FitContext, "shape_observations", lambda self, lengths=None: [*shape_observations(self, lengths), tape])
+    monkeypatch.setattr(FitContext, "shape_observations", lambda self, *given: [*shape_observations(self, *given), tape])
     assert abs(fit_sequence(given).shape.lengths_m[1] / free - 1.08) < 0.005
 
 

@@ -25,7 +25,6 @@ from .inputs.cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
 HYSTERESIS_M = 0.004  # motion of the body within which points keep their limbs
-FINGERTIP_M = 0.05  # how far it moves when fingers are bent by 1 more
 FACING = 0.6  # least cosine between a point's normal and the limb's
 WIDEST_M, NARROWEST_M = 0.030, 0.003  # of σ in (3)
 ROUNDS = 6  # of (2) and (3)
@@ -83,12 +82,7 @@ class SegmentationCache:
     def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
         """The segmentation for `key` of a body within `HYSTERESIS_M` of the present one; without one that of `find`."""
         tails = state.head_m + state.lengths_m[:, None] * state.R[:, :, 1]
-        hands = [*state.finger_bends]
-        sides = state.lengths_m[hands, None] * state.R[hands, :, 0]
-        bent = FINGERTIP_M * np.array([*state.finger_bends.values()])
-        now = np.concatenate(
-            [state.head_m.ravel(), tails.ravel(), sides.ravel(), bent, *(profile.radii_m.ravel() for profile in state.profiles.values())]
-        )
+        now = np.concatenate([state.head_m.ravel(), tails.ravel(), *(profile.radii_m.ravel() for profile in state.profiles.values())])
         if key not in self._found or np.abs(self._found[key][0] - now).max() > HYSTERESIS_M:
             self._found[key] = (now, find())
         return self._found[key][1]

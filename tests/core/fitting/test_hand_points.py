@@ -13,7 +13,7 @@ from tricap.core.fitting.hands import BACK, BEND_SIGMA, Fingers
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import HandPoints, PosePrior, ShapePrior
 from tricap.core.fitting.observations.hand_points import hand_gaps, hand_owners
-from tricap.core.fitting.segmentation import SegmentationCache, surface_points
+from tricap.core.fitting.segmentation import surface_points
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Estimate, Problem
 from tricap.core.fitting.solve.solver import solve
@@ -158,11 +158,3 @@ def test_the_prior_of_bends_counts_once_however_often_the_others_do() -> None:
         prior = next(p for p in fit.shape_observations(weight=weight) if isinstance(p, ShapePrior))
         np.testing.assert_allclose(prior.sigma[AT.group("bends")], BEND_SIGMA * np.sqrt(weight))
         assert prior.sigma[AT.group("radii")].max() == fit.settings.radius_sigma
-
-
-def test_points_are_assigned_anew_when_fingers_open_or_the_hand_turns() -> None:
-    cache, found = SegmentationCache(), []
-    turned = (15.0, 0.0, 0.0)
-    for pose, bend in ((_pose(), 1.0), (_pose(), 1.02), (_pose(), 1.5), (_pose(turned), 1.5), (_pose(turned), 1.5)):
-        found.append(cache.get("frame", PARAMETERS.state(pose, _vector(bend)), object))
-    assert [found.index(made) for made in found] == [0, 0, 2, 3, 3]
