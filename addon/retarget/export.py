@@ -189,7 +189,8 @@ def _copy_ply(out: Path, folder: Path, of: str, monitor: Monitor) -> str:
     if not files:
         raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     by = next(stage for stage, names in MADE_BY.items() if files[0].parent.name in names)
-    if by not in run["stages"] if "stages" in run else not run and (out / "cache").is_dir():
+    begun = not run and (out / "cache").is_dir()  # by a first run
+    if begun or by not in run.get("stages", {by}):
         raise InputError(f"{files[0].parent} is not finished: the run that makes it was stopped, or goes on; run the take first.")
     for n, file in enumerate(files):
         monitor.step("exporting", n, len(files))
