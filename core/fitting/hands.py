@@ -32,17 +32,11 @@ def hands_of(skeleton: Skeleton) -> tuple[int, ...]:
 
 @lru_cache(maxsize=32)
 def hand_capsules(left: bool, bend: float = RELAXED) -> tuple[np.ndarray, np.ndarray]:
-    """The ends (K, 2, 3) and the radii (K, 2) of a hand's capsules, in lengths of its bone; its fingers are bent as in `finger_frames`."""
-    ends, radii = [], []
-    for at_wrist, at_knuckles, half in PALM:
-        ends.append([(at_wrist, 0.15, 0.0), (at_knuckles, 0.95, 0.0)])
-        radii.append((half, 0.9 * half))
-    for finger in (*FINGERS, THUMB):
-        joints = finger_frames(finger, bend).joints
-        ends.append([tuple(joints[0]), tuple(joints[-1])])
-        radii.append((finger.radii_mm[0] / UNIT_MM, finger.radii_mm[-1] / UNIT_MM))
-    side = np.array([-1.0 if left else 1.0, 1.0, 1.0])
-    return np.array(ends) * side, np.array(radii)
+    """The ends (K, 2, 3) and the radii (K, 2) of a hand's capsules with one for each finger, in lengths of its bone."""
+    hand, n = Fingers.bent(left, bend), len(PALM)
+    of_fingers = (np.stack([table[n::3, 0], table[n + 2 :: 3, 1]], axis=1) for table in (hand.ends, hand.radii))
+    ends, radii = (np.concatenate([table[:n], fingers]) for table, fingers in zip((hand.ends, hand.radii), of_fingers))
+    return ends, radii
 
 
 def thumb_side(left: bool) -> np.ndarray:
@@ -54,7 +48,7 @@ def thumb_side(left: bool) -> np.ndarray:
 class Fingers:
     """The K capsules of a hand whose fingers are bent, one for each of their bones, in lengths of the hand's bone and its axes."""
 
-    first: np.ndarray  # (K, 3)
+    ends: np.ndarray  # (K, 2, 3)
     axis: np.ndarray  # (K, 3) unit
     length: np.ndarray  # (K,)
     radii: np.ndarray  # (K, 2) at both ends
@@ -77,7 +71,12 @@ class Fingers:
         both = np.array(ends) * side
         along = both[:, 1] - both[:, 0]
         length = np.linalg.norm(along, axis=1)
-        return Fingers(first=both[:, 0], axis=along / length[:, None], length=length, radii=np.array(radii), by_bend=np.array(moved) * side)
+        return Fingers(ends=both, axis=along / length[:, None], length=length, radii=np.array(radii), by_bend=np.array(moved) * side)
+
+    @property
+    def first(self) -> np.ndarray:
+        """(K, 3) the ends at which the axes begin."""
+        return self.ends[:, 0]
 
     @cached_property
     def taper(self) -> np.ndarray:
