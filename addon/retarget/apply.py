@@ -49,15 +49,15 @@ class Outcome:
     notes: tuple[str, ...]
 
 
-def map_of(rig: Rig, map_file: Path | None = None, *, controls: bool = False) -> RigMap:
-    """The mapping from a file, or as found. Of a control rig: with `controls` its controls, else its deform bones.
+def map_of(rig: Rig, map_file: Path | None = None, *, controls: bool = False, called: str = "this rig") -> RigMap:
+    """The mapping from a file, or as found. Of a control rig: with `controls` its controls, else its deform bones. `called`: in errors.
 
     Raises:
         InputError: the file is not a mapping of this rig, or no part was recognised.
     """
     if map_file is not None:
         return apply_preset(rig, read_preset(map_file))
-    return find_map(rig, presets(controls=controls))
+    return find_map(rig, presets(controls=controls), called=called)
 
 
 def read_target(armature_object: bpy.types.Object, map_file: Path | None = None, edited: RigMap | None = None) -> Target:
@@ -73,7 +73,7 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
         )
     rig = read_rig(armature_object)
     known = saved_maps.found_again(rig) if map_file is None and edited is None else None
-    rig_map = known or map_of(rig, map_file, controls=True)
+    rig_map = known or map_of(rig, map_file, controls=True, called=f"the armature “{armature_object.name}”")
     if edited is not None:
         rig_map = _edited(rig, rig_map, edited)
     if rig_map.control_rig is not None:

@@ -128,7 +128,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
     motion = files.open_motion(args.out, monitor, up=args.up, unit=args.unit)
-    source = MappedMotion(motion=motion, map=apply.map_of(motion.rig))
+    source = MappedMotion(motion=motion, map=apply.map_of(motion.rig, called=f"the motion of {args.out}"))
     files.open_rig(args.rig)
     armature_object = files.the_armature(args.armature, str(args.rig))
     target = apply.read_target(armature_object, args.map)

@@ -40,7 +40,7 @@ def open_rig(path: Path) -> None:
     """
     path = bounded.real_path(path)
     if not path.is_file():
-        raise InputError(f"There is no file {path}; check its name.")
+        raise InputError(f"{path} is a folder; choose a file." if path.is_dir() else f"There is no file {path}; check its name.")
     kind = path.suffix.lower()
     if kind not in RIG_FILES:
         raise InputError(f"{path.name} is not a rig in a known format; choose one of {', '.join(RIG_FILES)}.")

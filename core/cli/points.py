@@ -97,7 +97,11 @@ def _draw(folder: Path, footage: Footage, names: tuple[str, ...], tracked: KeyPo
 
 def _by_name(chosen: ChosenPoints, footage: Footage, path: Path) -> dict[str, dict[str, np.ndarray]]:
     points: dict[str, dict[str, np.ndarray]] = {}
+    cameras = [camera.name for camera in footage.rig.cameras]
     for name, view, xy in zip(chosen.names, chosen.views, chosen.xy_px):
+        if view not in cameras:
+            known = f"The take's views are {', '.join(cameras)}."
+            raise InputError(f"The point “{name}” of {path} is in view “{view}”, which the take does not have. {known}")
         if not footage.rig[view].sees(xy):
             raise InputError(f"The point “{name}” of {path} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of view {view}.")
         points.setdefault(name, {})[view] = xy

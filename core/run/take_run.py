@@ -195,6 +195,8 @@ def open_run(
             record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
             record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
             notes += _remove_all(results) if restart else _remove_stale(results, before, kept)
+            if record["stages"].keys() != before.get("stages", {}).keys():  # a run that is stopped leaves no word of what is made again
+                results.write_run(record)
             body_key = stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
             run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)
             run.replaced = partial(_are_others, footage, begun, Path(out), opened)
@@ -225,7 +227,7 @@ def _check_not_replaced(folder: Path, before: Mapping[str, Any], footage: Footag
         InputError: it would be.
     """
     stages, take, now = before.get("stages", {}), footage.take, footage.frames
-    if not stages or "measure" in valid_stages(before, keys):
+    if not before or "measure" in valid_stages(before, keys):
         return
     has_body = "fit" in stages and "not_done" not in stages["fit"]
     advice = "choose another folder for the results, or replace them with --restart."

@@ -16,7 +16,7 @@ import numpy as np
 from ..calibration.targets import TargetStatus, find_targets
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..geometry.intersection import forward_intersection, intersect_clicks
+from ..geometry.intersection import clicks_contradict, forward_intersection, intersect_clicks
 from ..images.sampling import SplineImage
 from ..matching.least_squares import SearchImage, TemplatePoints, match_patches
 from ..matching.patches import patch_offsets
@@ -82,9 +82,14 @@ def _clicked(points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView)
     xy = np.array([[at.get(c.name, (np.nan, np.nan)) for c in view.cameras] for at in points.values()], dtype=np.float64)
     xy = xy.reshape(-1, len(view.cameras), 2)
     point = intersect_clicks(view.cameras, xy)
-    for name, X in zip(points, point.xyz_m):
+    for name, at, X, missed, miss in zip(points, points.values(), point.xyz_m, clicks_contradict(point), point.rms_residual_px):
         if not np.isfinite(X).all():
-            raise InputError(f"The position of the key point “{name}” cannot be computed; click it in at least two views.")
+            what = "its clicks' rays do not meet; click it again" if len(at) > 1 else "click it in at least two views"
+            raise InputError(f"The position of the key point “{name}” cannot be computed; {what}.")
+        if missed:
+            raise InputError(
+                f"The clicks on the key point “{name}” contradict each other: their rays miss by {miss:.0f} px; click it again."
+            )
     for k, camera in enumerate(view.cameras):
         missing = np.isnan(xy[:, k, 0])
         xy[missing, k] = camera.project(point.xyz_m[missing])

@@ -152,6 +152,11 @@ def test_simulations_in_the_file_of_a_rig_write_nothing(empty: ModuleType, tmp_p
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_folder_is_no_rig(empty: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a folder; choose a file"):
+        open_rig(tmp_path)
+
+
 def test_a_rig_that_names_a_pipe_is_refused(empty: ModuleType, tmp_path: Path) -> None:
     path, picture = with_a_rig(empty, tmp_path), tmp_path / "skin.png"
     write_bytes(picture, png(np.zeros((4, 4), dtype=np.uint8)))

@@ -229,8 +229,10 @@ def best_preset(rig: Rig, presets: Sequence[Preset]) -> Preset | None:
     return max(fitting, key=lambda preset: (preset.control_rig is not None, fit_of(rig, preset)[1]), default=None)
 
 
-def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
+def find_map(rig: Rig, presets: Sequence[Preset] = (), *, called: str = "this rig") -> RigMap:
     """Recognise a rig: by its file's own roles, a preset's names, single names, and its shape, in that order of trust.
+
+    `called`: what it is called in an error.
 
     Raises:
         InputError: no part of a body could be recognised.
@@ -248,7 +250,7 @@ def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
     if named.bones:
         return named
     raise InputError(
-        "No part of a body could be recognised in this rig, neither by its bones' names nor by its shape;"
+        f"No part of a body could be recognised in {called}, neither by its bones' names nor by its shape;"
         " write a mapping (see docs/retargeting.md)."
     )
 

@@ -305,6 +305,9 @@ def test_a_run_without_a_body_is_replaced_without_a_question(plane_take: Path, t
     pipeline.run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, frames=(0, 3))
     with take_run.open_run(plane_take, tmp_path / "out", {"growing": {"spacing_px": 16}}, (0, 2), spares=True) as again:
         assert not again.record["stages"]
+    assert not json.loads((tmp_path / "out" / "run.json").read_text())[
+        "stages"
+    ]  # if it stops here, what is made again does not count as made
 
 
 def test_images_replaced_under_the_same_names_sizes_and_times_are_noticed_when_they_are_measured(plane_take: Path, tmp_path: Path) -> None:

@@ -136,6 +136,16 @@ def test_one_click_is_not_enough(scenes: Any) -> None:
         follow(scenes, 0.0, ("C",))
 
 
+@pytest.mark.parametrize(
+    ("clicks", "said"), [("n,X,9,9", "“X”, which the take does not have"), ("n,L,9,9\nn,C,9,90", "their rays miss by 41 px")]
+)
+def test_clicks_without_a_place_are_named(clicks: str, said: str, tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[scenes.Body()]], noise=1.0)
+    (tmp_path / "points.csv").write_text(f"point,view,x,y\n{clicks}\n")
+    assert main(["track", str(take), "--out", str(tmp_path / "out"), "--points", str(tmp_path / "points.csv"), "--quiet"]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """`tricap track --points` from a frame in the middle: both ways, in space within 1 mm across the line of sight."""
     bodies = [scenes.Body().moved(np.eye(3), [0.01 * i, 0.0, 0.0]) for i in range(4)]
