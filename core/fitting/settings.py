@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 25"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 26"  # part of the fit's key: raise it when the same input gives another body
 START_ALONE = ("auto", "full", "upper_body")  # models whose joints need no clicks; a limb starts alone where its person is visible
 
 

@@ -1,70 +1,121 @@
-"""The zero of the head's angles: the face looks ahead, and neither up nor down.
+"""The zero of the head's angles, and the place of its joint: the face looks ahead, and the skull turns on the neck where skulls do.
 
 The fitted head is an ellipsoid along the line from chin to crown, which shows neither nose nor chin: its angles follow the motion, but from
-a zero of their own. Where the face of the skin was registered to the measured points (`head_place`), the rotation F from the bone's axes
-to those of the face is known. With it, the bone has the face's axes in all frames,
+a zero of their own, and where the neck ends under it no surface shows. Where the face of the skin was registered to the measured points
+(`head_place`), the rotation F from the bone's axes to those of the face is known, and the place d of the joint in the bone's axes. With
+them, the bone has the face's axes and begins there in all frames,
 
-    E(θ') = E(θ) F ,    x' = Fᵀ x                                                                          (1)
+    E(θ') = E(θ) F ,    X_t = h_t + E(θ_t) d ,    x' = Fᵀ (x − d)                                          (1)
 
-E being the rotation of the bone's three angles, and x what the bone carries: metaballs, and the skin, whose rest pose becomes the one in
-which the face looks ahead. Nothing moves in the frames themselves.
+E being the rotation of the head, h the joint as it was, and x what the bone carries: metaballs, and the skin, whose rest pose becomes the
+one in which the face looks ahead. The neck's two angles point it at X in every frame, its length L' is the median of |X − n|, n being where
+it begins, and what it carries turns the other way by G, the mean turn in its own axes. Nothing moves in the frames themselves, but for what
+|X − n| differs from L' in them.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...geometry.rotation import rotation_from_vector
+from ...geometry.rotation import rotate, rotation_from_vector, shortest, transposed, unit
 from ..motion import BodyFit
 from ..shape import BodyShape
-from ..skeleton import Bone, joint_positions
+from ..skeleton import LENGTHS_M, Skeleton, bone_frames, joint_positions
 from .closed_skin import OneSkin
 from .ends import HEAD
 from .posed import Poser
 
 SIGMA = 0.08  # rad, of a registered face about each axis
+ALONG = np.array([0.0, 1.0, 0.0])  # a bone, in its axes
 
 
-def facing_ahead(body: BodyFit, skin: OneSkin, shape: BodyShape, turn: np.ndarray) -> tuple[BodyFit, OneSkin, BodyShape]:
-    """The same with F, given as its Rodrigues vector (3,), in (1): a fit, its skin in the rest pose, and the shape that carries the skin.
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Facing:
+    """Where the face looks, and where the head begins and ends, in the axes of the head's bone."""
 
-    They stay as they are if the head does not turn about three axes.
+    turn: np.ndarray  # (3,) F as its Rodrigues vector
+    joint_m: np.ndarray  # (3,) d
+    crown_m: np.ndarray  # (3,) the end of the bone
+
+
+def facing_ahead(
+    body: BodyFit, skin: OneSkin, shape: BodyShape, facing: Facing, *, joint: bool = True
+) -> tuple[BodyFit, OneSkin, BodyShape]:
+    """The same with (1): a fit, its skin in the rest pose, and the shape that carries the skin. `joint`: false where d is to be 0.
+
+    They stay as they are if the head does not turn about three axes, and d is 0 if the neck does not about two across it.
     """
-    skeleton, F = body.shape.skeleton, rotation_from_vector(turn)
+    skeleton = body.shape.skeleton
     b = next((i for i, bone in enumerate(skeleton.bones) if bone.name == HEAD), -1)
-    columns = [i for i in range(len(skeleton.dofs)) if skeleton.dof_bone[i] == b and i not in skeleton.locked]
-    if b < 0 or len(columns) < 3:
+    if b < 0 or len(_free(skeleton, b)) < 3:
         return body, skin, shape
-    bone, motion = skeleton.bones[b], body.motion
-    columns = sorted(columns, key=lambda i: _order(bone).index(skeleton.dofs[i].axis))
+    n, F = int(skeleton.parents[b]), rotation_from_vector(facing.turn)
+    joint = joint and n >= 0 and bool(skeleton.starts_at_tail[b]) and {axis for _, axis in skeleton.turn_order[n]} == {0, 2}
+    joint = joint and skeleton.parents[n] >= 0 and len(_free(skeleton, n)) == 2
+    d = facing.joint_m if joint else np.zeros(3)
+    motion, lengths = body.motion, body.shape.lengths_m.copy()
     values, covariance = motion.values.copy(), motion.covariance.copy()
-    values[:, columns] = _turned(bone, values[:, columns], F)
+    R, head = bone_frames(skeleton, lengths, values)
+    G = np.eye(3)
+    if joint:
+        neck = head[:, b] + R[:, b] @ d - head[:, n]
+        lengths[n] = np.clip(np.median(np.linalg.norm(neck, axis=1)), *LENGTHS_M)
+        lengths[b] = np.clip((facing.crown_m - d) @ F[:, 1], *LENGTHS_M)
+        G = shortest(ALONG, unit(rotate(transposed(R[:, n]), neck)).mean(axis=0))
+        _point(skeleton, n, values, unit(rotate(transposed(R[:, skeleton.parents[n]] @ skeleton.rest_to_parent[n]), neck)))
+    stands = bone_frames(skeleton, lengths, values)[0][:, n] @ skeleton.rest_to_parent[b]
+    columns = _free(skeleton, b)
+    values[:, columns] = _angles(skeleton, b, transposed(stands) @ R[:, b] @ F)
     covariance[:, columns, columns] += SIGMA**2
-    joints = motion.joints_m.copy()
-    joints[:, motion.joint_names.index(bone.tail_joint)] = joint_positions(skeleton, body.shape.lengths_m, values)[bone.tail_joint]
+    places, joints = joint_positions(skeleton, lengths, values), motion.joints_m.copy()
+    for name in (skeleton.bones[b].head_joint, skeleton.bones[b].tail_joint):
+        joints[:, motion.joint_names.index(name)] = places[name]
+    carried = [(n, G, np.zeros(3)), (b, F, d)]
     moved = replace(motion, values=values, covariance=covariance, joints_m=joints)
-    ahead = np.zeros(values.shape[1])
-    ahead[columns] = _turned(bone, np.zeros((1, 3)), F.T)[0]
-    skin = replace(skin, vertices_m=Poser(shape, skin.weights).posed(skin.vertices_m, ahead))
-    return replace(body, shape=_with_balls_turned(body.shape, b, F), motion=moved), skin, _with_balls_turned(shape, b, F)
+    carrying = _with(shape, lengths, carried)
+    skin = replace(skin, vertices_m=_at_rest(skin, shape, carrying.lengths_m, carried))
+    return replace(body, shape=_with(body.shape, lengths, carried), motion=moved), skin, carrying
 
 
-def _order(bone: Bone) -> str:
-    """The axes of a bone's rotation, from the outermost on."""
-    return bone.rotation_mode[::-1].lower()
+def _free(skeleton: Skeleton, b: int) -> list[int]:
+    """The columns of a bone's angles, from the outermost on."""
+    return [column for column, _ in skeleton.turn_order[b] if column not in skeleton.locked]
 
 
-def _turned(bone: Bone, angles: np.ndarray, F: np.ndarray) -> np.ndarray:
-    """θ' (T, 3) of (1) for θ (T, 3), in the order of the bone's rotation."""
+def _angles(skeleton: Skeleton, b: int, R: np.ndarray) -> np.ndarray:
+    """The three angles (T, 3) of rotations (T, 3, 3), in the order of the bone's rotation."""
     from scipy.spatial.transform import Rotation
 
-    order = _order(bone).upper()
-    return np.asarray((Rotation.from_euler(order, angles) * Rotation.from_matrix(F)).as_euler(order))
+    return np.asarray(Rotation.from_matrix(R).as_euler("".join("XYZ"[axis] for _, axis in skeleton.turn_order[b])))
 
 
-def _with_balls_turned(shape: BodyShape, b: int, F: np.ndarray) -> BodyShape:
-    """The metaballs of bone b at the same place, and their cross radii about the new axes."""
-    balls, centre = shape.metaballs, shape.metaballs.centre.copy()
-    own = balls.bone_index == b
-    centre[own] = centre[own] @ F
-    return replace(shape, metaballs=replace(balls, centre=centre))
+def _point(skeleton: Skeleton, n: int, values: np.ndarray, direction: np.ndarray) -> None:
+    """Set a bone's angles about x and z so that it points in directions (T, 3), given in its axes before it turns."""
+    (first, axis), (second, _) = skeleton.turn_order[n]
+    x, y, z = direction.T
+    if axis == 0:  # R_x R_z y = (−sin c, cos c cos a, cos c sin a)
+        values[:, first], values[:, second] = np.arctan2(z, y), -np.arcsin(np.clip(x, -1, 1))
+    else:  # R_z R_x y = (−sin c cos a, cos c cos a, sin a)
+        values[:, first], values[:, second] = np.arctan2(-x, y), np.arcsin(np.clip(z, -1, 1))
+
+
+Carried = list[tuple[int, np.ndarray, np.ndarray]]  # bones, with the F and d of (1) by which what they carry changes
+
+
+def _at_rest(skin: OneSkin, shape: BodyShape, lengths_m: np.ndarray, carried: Carried) -> np.ndarray:
+    """The vertices (V, 3) of the rest pose, of a body with these lengths."""
+    R, head = bone_frames(shape.skeleton, lengths_m, np.zeros(len(shape.skeleton.dofs)))
+    for b, F, d in carried:
+        R[b] = R[b] @ F.T
+        head[b] = head[b] - R[b] @ d
+    return Poser(shape, skin.weights).moved(skin.vertices_m, R, head)[0]
+
+
+def _with(shape: BodyShape, lengths_m: np.ndarray, carried: Carried) -> BodyShape:
+    """Other lengths of these bones, and their metaballs at the same places."""
+    balls, lengths = shape.metaballs, shape.lengths_m.copy()
+    centre = balls.centre.copy()
+    for b, F, d in carried:
+        own, lengths[b] = balls.bone_index == b, lengths_m[b]
+        centre[own] = (centre[own] * shape.lengths_m[b] - d) @ F / lengths[b]
+    return replace(shape, lengths_m=lengths, metaballs=replace(balls, centre=centre))

@@ -23,6 +23,7 @@ from ..skeleton import bone_frames
 from .closed_skin import OneSkin
 from .ends import HEAD
 from .extremities import NECK, has_end
+from .facing import Facing
 from .relief import LEAST_COSINE, Nearby, SurfacePoints
 from .surface_operators import vertex_normals
 
@@ -30,6 +31,7 @@ MEAN = np.array([0.0, 0.0, 0.0, -0.38, 0.0, 0.0, 0.0, 0.0, 0.0])  # of p: the fi
 PRIOR = np.array([0.01, 0.03, 0.015, 0.1, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p of t [m], Rodrigues vector of Q, ln S: to the side, up, ahead
 SIZE = 0.1  # … and what the three ln S have in common
 LEVEL = np.array([0.165, 0.0, 0.0])  # the anatomical head looks up by so much [rad], where a level one is registered to it
+JOINT_M = np.array([0.0, 0.020, -0.008])  # where the anatomical head turns on the neck, in the axes of the bone, before it is registered
 MOST_TURN = 0.45  # rad, of Q to the side
 FARTHEST_M = 0.03  # of a point from the skin
 SIGMA_M = 0.003  # σ: what a face differs from the anatomical one
@@ -50,20 +52,23 @@ class HeadPlace:
     p: np.ndarray  # (9,) of (1)
     R: np.ndarray  # (3, 3) axes of its bone in the rest pose
     head_m: np.ndarray  # (3,) where its bone begins there
+    length_m: float  # of the bone
 
     def moved(self, skin: OneSkin) -> OneSkin:
         """The skin of the rest pose with its head there."""
         return replace(skin, vertices_m=self.head_m + self.head.at(self.p) @ self.R.T)
 
     @property
-    def face_turn(self) -> np.ndarray | None:
-        """Where the face looks: the rotation from the axes of the head's bone to those of the face, as a Rodrigues vector (3,).
+    def facing(self) -> Facing | None:
+        """Where the face looks, and where the head begins and ends, in the axes of its bone.
 
         None if the head would be turned by more than a fit is wrong: then the points do not show the face.
         """
         if abs(self.p[4]) > MOST_TURN:
             return None
-        return vector_from_rotation(rotation_from_vector(self.p[3:6]) @ rotation_from_vector(LEVEL))
+        joint, crown = _moved(np.stack([JOINT_M, [0.0, self.length_m, 0.0]]), self.head.middle, self.p)
+        turn = vector_from_rotation(rotation_from_vector(self.p[3:6]) @ rotation_from_vector(LEVEL))
+        return Facing(turn=turn, joint_m=joint, crown_m=crown)
 
 
 def registered_head(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> HeadPlace | None:
@@ -84,7 +89,7 @@ def registered_head(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     share = Nearby(skin.vertices_m, skin.faces).mean(weight[:, None])  # wider than the weights, or throat and nape would fold
     movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R, share=share, own=own > OWN)
     p = _registered(movable, points, normals)
-    return None if p is None else HeadPlace(head=movable, p=p, R=R, head_m=head)
+    return None if p is None else HeadPlace(head=movable, p=p, R=R, head_m=head, length_m=float(shape.lengths_m[b]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -1,4 +1,4 @@
-"""The zero of the head's angles: nothing moves in the frames, and the bone has the face's axes."""
+"""The zero of the head's angles and its joint: nothing moves in the frames, and the bone has the face's axes and begins at the joint."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from tricap.core.body.motion import FITTED, SEEN, BodyFit, BodyMotion
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.body.skin.closed_skin import OneSkin
-from tricap.core.body.skin.facing import SIGMA, facing_ahead
+from tricap.core.body.skin.facing import SIGMA, Facing, facing_ahead
 from tricap.core.body.skin.fingers import shape_for_skin
 from tricap.core.body.skin.head_place import LEVEL, MOST_TURN, registered_head
 from tricap.core.body.skin.mesh import SkinSettings
@@ -22,6 +22,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import rotation_from_vector, vector_from_rotation
 
 TURN = np.radians([-15.0, 9.0, 4.0])
+FACING = Facing(turn=TURN, joint_m=np.array([0.01, -0.04, 0.015]), crown_m=np.array([0.0, 0.14, 0.0]))
 
 
 def _fit(model: str, frames: int = 3) -> BodyFit:
@@ -67,7 +68,7 @@ def test_the_bone_turns_and_nothing_moves() -> None:
     body = _fit("full")
     shape = body.shape
     skin = _skin_of_one_quad(shape, "head")
-    moved, ahead, carrying = facing_ahead(body, skin, shape, TURN)
+    moved, ahead, carrying = facing_ahead(body, skin, shape, FACING, joint=False)
     head = [bone.name for bone in shape.skeleton.bones].index("head")
     before, after = (bone_frames(shape.skeleton, shape.lengths_m, m.motion.values)[0] for m in (body, moved))
     np.testing.assert_allclose(after[:, head], before[:, head] @ rotation_from_vector(TURN), atol=1e-12)
@@ -85,10 +86,39 @@ def test_the_bone_turns_and_nothing_moves() -> None:
     assert np.isclose(moved.motion.sigma, SIGMA).any(axis=0).sum() == 3
 
 
+@pytest.mark.parametrize(("stiff", "within_m"), [(True, 1e-9), (False, 0.02)])
+def test_the_joint_moves_and_nothing_else_does(stiff: bool, within_m: float) -> None:
+    """The neck has another length, the same in all frames: where the head nods, its place is a compromise along the neck."""
+    body = _fit("full", 5)
+    shape, values = body.shape, body.motion.values.copy()
+    names = [bone.name for bone in shape.skeleton.bones]
+    head, neck = names.index("head"), names.index("neck")
+    if stiff:
+        for b in (head, neck):
+            values[:, shape.skeleton.dof_bone == b] = 0.1
+    body = replace(body, motion=replace(body.motion, values=values))
+    skin = _skin_of_one_quad(shape, "head")
+    moved, rest, carrying = facing_ahead(body, skin, shape, FACING)
+    (R, at), (R_now, now) = (bone_frames(m.shape.skeleton, m.shape.lengths_m, m.motion.values) for m in (body, moved))
+    np.testing.assert_allclose(now[:, head], at[:, head] + R[:, head] @ FACING.joint_m, atol=within_m)
+    np.testing.assert_allclose(R_now[:, head], R[:, head] @ rotation_from_vector(TURN), atol=1e-9)
+    np.testing.assert_allclose(np.delete(now, head, axis=1), np.delete(at, head, axis=1), atol=1e-12)
+    np.testing.assert_allclose(_balls_m(moved.shape, moved.motion.values), _balls_m(shape, values), atol=max(within_m, 0.003))
+    for old, new in zip(values, moved.motion.values):
+        before = Poser(shape, skin.weights).posed(skin.vertices_m, old)
+        np.testing.assert_allclose(Poser(carrying, rest.weights).posed(rest.vertices_m, new), before, atol=within_m)
+    places = joint_positions(moved.shape.skeleton, moved.shape.lengths_m, moved.motion.values)
+    for joint in ("head", "crown"):
+        np.testing.assert_allclose(moved.motion.joints_m[:, moved.motion.joint_names.index(joint)], places[joint], atol=1e-12)
+    crown = at[:, head] + R[:, head] @ FACING.crown_m
+    beyond = np.einsum("ti,ti->t", places["crown"] - crown, R_now[:, head, :, 1])
+    np.testing.assert_allclose(beyond, 0.0, atol=within_m)  # as far as the crown, in the face's axes
+
+
 def test_a_body_without_a_head_stays() -> None:
     body = _fit("arm.R")
     skin = _skin_of_one_quad(body.shape, "forearm.R")
-    assert facing_ahead(body, skin, body.shape, TURN) == (body, skin, body.shape)
+    assert facing_ahead(body, skin, body.shape, FACING) == (body, skin, body.shape)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +149,7 @@ def test_a_face_tells_where_the_head_looks(person) -> None:
     turn = np.radians([-24.0, 12.0, 3.0])
     expected = vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(LEVEL))
     np.testing.assert_allclose(
-        np.degrees(registered_head(skin, shape, _points(shape, skin, turn)).face_turn), np.degrees(expected), atol=2.0
+        np.degrees(registered_head(skin, shape, _points(shape, skin, turn)).facing.turn), np.degrees(expected), atol=2.0
     )
 
 
@@ -130,7 +160,7 @@ def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
     few = [replace(p, xyz_m=p.xyz_m[:5], normals=p.normals[:5], sigma_m=p.sigma_m[:5]) for p in _points(shape, skin, TURN)]
     assert registered_head(skin, shape, few) is None
     aside = np.array([-0.4, 1.3 * MOST_TURN, 0.0])  # further than a fit is wrong
-    assert registered_head(skin, shape, _points(shape, skin, aside)).face_turn is None
+    assert registered_head(skin, shape, _points(shape, skin, aside)).facing is None
 
 
 @pytest.mark.slow
