@@ -15,7 +15,6 @@ from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..body.shape import write_body
 from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
-from ..body.skin.ends import HEAD
 from ..body.skin.facing import facing_ahead
 from ..body.skin.fingers import shape_for_skin
 from ..body.skin.head_place import registered_head
@@ -405,9 +404,7 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
         place = registered_head(skin, person, points)
         skin = with_relief(skin, person, points, place, settings.mirror, monitor)
         if place is not None and place.facing is not None:
-            take = run.footage.take
-            clicked = any(HEAD in frame.joints for frame in (take.clicks, *take.keyframes))
-            body, skin, person = facing_ahead(body, skin, person, place.facing, joint=not clicked)
+            body, skin, person = facing_ahead(body, skin, person, place.facing, run.footage.take.clicked_joints)
     write_skin(run.results.path("skin", REST), skin)
     if settings.texture_px:
         _write_texture(run, body, TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)

@@ -188,6 +188,11 @@ class Take:
         return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, clicks=clicks, keyframes=tuple(keys))
 
     @property
+    def clicked_joints(self) -> frozenset[str]:
+        """The names of the joints that are clicked in any frame."""
+        return frozenset(name for frame in (self.clicks, *self.keyframes) for name in frame.joints)
+
+    @property
     def joints_model(self) -> str | None:
         """See `model_of_joints`."""
         return model_of_joints(self.body_model)

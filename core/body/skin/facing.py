@@ -13,6 +13,7 @@ it begins, and what it carries turns the other way by G, the mean turn in its ow
 |X − n| differs from L' in them.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,25 +40,25 @@ class Facing:
 
 
 def facing_ahead(
-    body: BodyFit, skin: OneSkin, shape: BodyShape, facing: Facing, *, joint: bool = True
+    body: BodyFit, skin: OneSkin, shape: BodyShape, facing: Facing, clicked: Collection[str] = ()
 ) -> tuple[BodyFit, OneSkin, BodyShape]:
-    """The same with (1): a fit, its skin in the rest pose, and the shape that carries the skin. `joint`: false where d is to be 0.
+    """The same with (1): a fit, its skin in the rest pose, and the shape that carries the skin.
 
-    They stay as they are if the head does not turn about three axes, and d is 0 if the neck does not about two across it.
+    They stay as they are without a head that another bone carries and that turns about three axes. d is 0 if the head's joint is among the
+    `clicked` ones, whose clicks say where it is, or if the neck does not turn about two axes across it.
     """
     skeleton = body.shape.skeleton
     b = next((i for i, bone in enumerate(skeleton.bones) if bone.name == HEAD), -1)
-    if b < 0 or len(_free(skeleton, b)) < 3:
+    n, F = int(skeleton.parents[b]) if b >= 0 else -1, rotation_from_vector(facing.turn)
+    if n < 0 or len(_free(skeleton, b)) < 3:
         return body, skin, shape
-    n, F = int(skeleton.parents[b]), rotation_from_vector(facing.turn)
-    joint = joint and n >= 0 and bool(skeleton.starts_at_tail[b]) and {axis for _, axis in skeleton.turn_order[n]} == {0, 2}
-    joint = joint and skeleton.parents[n] >= 0 and len(_free(skeleton, n)) == 2
-    d = facing.joint_m if joint else np.zeros(3)
+    moves = skeleton.bones[b].head_joint not in clicked and bool(skeleton.starts_at_tail[b]) and _turns_across(skeleton, n)
+    d = facing.joint_m if moves else np.zeros(3)
     motion, lengths = body.motion, body.shape.lengths_m.copy()
     values, covariance = motion.values.copy(), motion.covariance.copy()
     R, head = bone_frames(skeleton, lengths, values)
     G = np.eye(3)
-    if joint:
+    if moves:
         neck = head[:, b] + R[:, b] @ d - head[:, n]
         lengths[n] = np.clip(np.median(np.linalg.norm(neck, axis=1)), *LENGTHS_M)
         lengths[b] = np.clip((facing.crown_m - d) @ F[:, 1], *LENGTHS_M)
@@ -80,6 +81,11 @@ def facing_ahead(
 def _free(skeleton: Skeleton, b: int) -> list[int]:
     """The columns of a bone's angles, from the outermost on."""
     return [column for column, _ in skeleton.turn_order[b] if column not in skeleton.locked]
+
+
+def _turns_across(skeleton: Skeleton, n: int) -> bool:
+    """Whether a bone is not the first one, and turns about x and z alone."""
+    return skeleton.parents[n] >= 0 and {axis for _, axis in skeleton.turn_order[n]} == {0, 2} and len(_free(skeleton, n)) == 2
 
 
 def _angles(skeleton: Skeleton, b: int, R: np.ndarray) -> np.ndarray:

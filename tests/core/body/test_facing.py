@@ -68,7 +68,7 @@ def test_the_bone_turns_and_nothing_moves() -> None:
     body = _fit("full")
     shape = body.shape
     skin = _skin_of_one_quad(shape, "head")
-    moved, ahead, carrying = facing_ahead(body, skin, shape, FACING, joint=False)
+    moved, ahead, carrying = facing_ahead(body, skin, shape, FACING, {"head"})  # a clicked joint stays
     head = [bone.name for bone in shape.skeleton.bones].index("head")
     before, after = (bone_frames(shape.skeleton, shape.lengths_m, m.motion.values)[0] for m in (body, moved))
     np.testing.assert_allclose(after[:, head], before[:, head] @ rotation_from_vector(TURN), atol=1e-12)
