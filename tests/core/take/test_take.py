@@ -86,6 +86,7 @@ def test_corrections_and_keyframes(tmp_path: Path) -> None:
     take = read(tmp_path, text(more=more))
     assert take.locked == ("elbow.R twist",) and take.limits == {"elbow.R flexion": (0.0, 140.0)}
     assert [k.frame for k in take.keyframes] == [1, 3] and take.keyframes[1].joints["elbow.R"]["L"].tolist() == [5, 5]
+    assert take.clicked_joints >= {"elbow.R"}
     one, region = take.corrections
     assert (one.kind, one.view, one.frames, one.xy_px.tolist()) == ("trajectory", "L", range(4, 5), [[3, 4.5]])
     assert (region.kind, region.view, region.frames, region.xy_px.shape) == ("region", "C", range(2, 9), (3, 2))
