@@ -49,6 +49,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     points = _by_name(read_points(args.points, with_views=True), footage, args.points)
     views = tuple(c.name for c in footage.rig.cameras)
     with Results(args.out).opened() as results:
+        take_run.check_same_take(results.folder, results.read_run(), take)
         check_replaceable(results.path("points3d.csv"), SPACE_HEAD)
         check_replaceable(results.path("points2d.csv"), IMAGES_HEAD)
         tracked = follow_points(footage, points, first, settings, monitor)

@@ -1,4 +1,4 @@
-"""A file that a command writes is none that it reads, and no part of a take, whatever way leads there."""
+"""A file that a command writes is none that it reads, no part of a take, and no result of a run, whatever way leads there."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,6 +9,7 @@ from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
 from ..take.footage_files import take_files
 from ..take.take import read_take
+from .blend_file import BLEND
 from .folder import check_not_result, is_result
 
 LONGEST_START = 200  # bytes
@@ -19,7 +20,7 @@ def check_output(file: Path, inputs: Iterable[Path] = (), *, may_be_rig: bool = 
     """Check what a command is to write, a file or a folder. `may_be_rig`: it is a rig, which may replace the one of a take.
 
     Raises:
-        InputError: it is an input, or lies in a folder of images that is one, or belongs to a take.
+        InputError: it is an input, or lies in a folder of images that is one, or belongs to a take, or a run made it.
     """
     ways, inputs = {Path(os.path.abspath(file)), bounded.real_path(file)}, [path for path in inputs if path.exists()]
     for path in inputs:
@@ -30,7 +31,13 @@ def check_output(file: Path, inputs: Iterable[Path] = (), *, may_be_rig: bool = 
             raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
         if is_run:
             check_not_result(file, path)
-    for folder in {folder for way in ways for folder in (way, *way.parents[:LEVELS]) if (folder / "take.toml").is_file()}:
+    above = {folder for way in ways for folder in (way, *way.parents[:LEVELS])}
+    read = {bounded.real_path(path) for path in inputs}
+    for folder in above:
+        is_scene = bounded.real_path(file) == bounded.real_path(folder) / BLEND and bounded.real_path(folder) not in read
+        if (is_scene or is_result(file, folder)) and bounded.is_of_a_run(folder):
+            raise InputError(f"{file} is a result of the run in {folder}; choose another name, so that it is not replaced.")
+    for folder in (folder for folder in above if (folder / "take.toml").is_file()):
         _check_apart(file, ways, folder, may_be_rig)
     for folder in filter(None, map(_take_of_run, inputs)):
         _check_apart(file, ways, folder, may_be_rig)

@@ -180,6 +180,7 @@ def open_run(
     with Results(out).opened() as results:
         before, digests = {} if restart else results.read_run(), FileDigests()
         if for_contours:
+            check_same_take(results.folder, before, take)
             _check_frames(results.folder, before, footage.frames)
 
         def by_content() -> dict[str, str]:
@@ -220,23 +221,36 @@ def _check_frames(folder: Path, before: Mapping[str, Any], frames: range) -> Non
         )
 
 
+def check_same_take(folder: Path, before: Mapping[str, Any], take: Take, advice: str = "choose another folder for the results.") -> None:
+    """Check that results, if there are any in a folder, are of this take.
+
+    Raises:
+        InputError: they are of another one.
+    """
+    earlier, text = Path(before.get("take", "")), store.digest(take.folder / "take.toml")
+    is_there, is_copy = (earlier / "take.toml").is_file(), before.get("inputs", {}).get("take.toml") == text
+    if before and earlier != take.folder and is_there and not is_copy:  # a take that was moved is no longer there
+        raise InputError(f"{folder} has {'the fitted body' if _has_body(before) else 'results'} of another take, {earlier}; {advice}")
+
+
+def _has_body(before: Mapping[str, Any]) -> bool:
+    stages = before.get("stages", {})
+    return "fit" in stages and "not_done" not in stages["fit"]
+
+
 def _check_not_replaced(folder: Path, before: Mapping[str, Any], footage: Footage, keys: Mapping[str, str]) -> None:
     """Check that results are not replaced by those of another take, nor a finished body by that of frames that lack some of its own.
 
     Raises:
         InputError: it would be.
     """
-    stages, take, now = before.get("stages", {}), footage.take, footage.frames
+    take, now = footage.take, footage.frames
     if not before or "measure" in valid_stages(before, keys):
         return
-    has_body = "fit" in stages and "not_done" not in stages["fit"]
     advice = "choose another folder for the results, or replace them with --restart."
-    earlier, text = Path(before.get("take", "")), store.digest(take.folder / "take.toml")
-    is_there, is_copy = (earlier / "take.toml").is_file(), before.get("inputs", {}).get("take.toml") == text
-    if earlier != take.folder and is_there and not is_copy:  # a take that was moved is no longer there
-        raise InputError(f"{folder} has {'the fitted body' if has_body else 'results'} of another take, {earlier}; {advice}")
+    check_same_take(folder, before, take, advice)
     first, end = before.get("frames", (now.start, now.stop))
-    if has_body and before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
+    if _has_body(before) and before.get("interlaced") == take.interlaced and not now.start <= first < end <= now.stop:
         raise InputError(f"{folder} has the fitted body of the frames {first}:{end}; for {now.start}:{now.stop} {advice}")
 
 

@@ -195,6 +195,17 @@ def test_pictures_replace_no_result(tmp_path: Path) -> None:
     check_output(tmp_path / "body.blend", [tmp_path])
 
 
+def test_no_result_of_a_run_is_replaced_by_another_command(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    out, rig = tmp_path / "out", str(take / "rig.toml")
+    assert main.main([*MEASURE, str(take), "--out", str(out)]) == 0
+    before = names(out)
+    for argv in (["calibrate", "--import", rig], ["fields"]):
+        for name in ("body.toml", "body.blend", "report/figures.csv"):
+            assert "is a result of the run in" in refused([*argv, "--out", str(out / name)], capfd)
+    assert names(out) == before
+    check_output(out / "mine.csv")
+
+
 def test_2d_tracks_replace_neither_their_points_nor_the_images(take: Path, capfd: Capture) -> None:
     (take / "points.csv").write_text("point,x,y\na,60,60\n")
     before = names(take)
