@@ -1,15 +1,10 @@
-"""`dev.py gui-test`: Tricap's workflow in a true Blender window, by mouse and keys. Pictures are kept.
-
-As many windows are open as the machine has cores, two at most; a script that times the window (ALONE = True) has the machine for itself.
-"""
+"""`dev.py gui-test`: Tricap's workflow in a true Blender window, by mouse and keys. One script after the other, pictures kept."""
 
 import argparse
-import os
 import re
 import signal
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import chroot
@@ -20,19 +15,18 @@ ROOT = HERE.parents[1]
 SCRIPTS = ("sample", "workflow", "control_rig", "over_footage", "review", "smooth", "points", "points_2d")
 LIMIT_S = 480.0
 SIZE = (1600, 1000)
-WINDOWS = 2
 
 
 def main() -> int:
     """Set up, run the scripts, say how each went; exit code 0 if all passed or nothing could be set up."""
     options = _parser().parse_args()
-    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that Blender and its display end too
     began = time.monotonic()
     try:
         root = chroot.set_up(options.root, install=options.install)
         program = "the module's Blender" if options.module else chroot.version(root)
         say(f"{program} is ready in {root} ({time.monotonic() - began:.0f} s)")
-        failed = _failed(root, [path.resolve() for path in options.scripts], options)
+        failed = [path.stem for path in options.scripts if not _passed(root, path.resolve(), options)]
     except chroot.Unavailable as why:
         say(f"gui-test: skipped, for {why}.")
         return 0
@@ -40,25 +34,7 @@ def main() -> int:
     return 1 if failed else 0
 
 
-def _stop(*_: object) -> None:
-    """Let Blender and its display end too."""
-    window.STOPPED.set()
-    sys.exit(143)
-
-
-def _failed(root: Path, scripts: list[Path], options: argparse.Namespace) -> list[str]:
-    """The names of the scripts that fail."""
-    alone = [path for path in scripts if re.search(r"^ALONE = True", path.read_text(encoding="utf-8"), re.MULTILINE)]
-    passed = {path: _passed(root, path, options) for path in alone}
-    others = [path for path in scripts if path not in alone]
-    with ThreadPoolExecutor(min(WINDOWS, os.cpu_count() or 1)) as windows:
-        passed |= zip(others, windows.map(lambda path: _passed(root, path, options), others))
-    return [path.stem for path in scripts if not passed[path]]
-
-
 def _passed(root: Path, script: Path, options: argparse.Namespace) -> bool:
-    if window.STOPPED.is_set():
-        return False
     began, out = time.monotonic(), options.out / script.stem
     code = window.run_script(root, options.package, script, out, options.limit, options.data, _size(script), module=options.module)
     how = {0: "passed", window.TIMED_OUT: "stopped"}.get(code, f"failed (exit code {code})")

@@ -13,7 +13,6 @@ import drive
 import numpy as np
 
 SIZE = (640, 480)
-ALONE = True
 GAP_S = 0.1  # a person does not notice
 BUSY = 2.0  # jobs for each core: from there on the window waits longer for its turn than for Python
 RARELY = 0.01  # of the gaps may be longer

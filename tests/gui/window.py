@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,6 @@ from chroot import SHARE, Unavailable
 DRIVER = Path(__file__).with_name("drive.py")
 MODULE = Path(__file__).with_name("module_window.py")
 TIMED_OUT, OTHER_BUILD = 124, 4  # exit codes; OTHER_BUILD is that of MODULE
-STOPPED = threading.Event()  # all windows are to end
 
 
 def run_script(
@@ -139,7 +137,7 @@ def _drive(
 def _ended(blender: "subprocess.Popen[bytes]", limit_s: float) -> int:
     """The exit code; TIMED_OUT after as many seconds of a machine that does nothing else."""
     spent, before = 0.0, time.monotonic()
-    while spent < limit_s and not STOPPED.is_set():
+    while spent < limit_s:
         try:
             return blender.wait(1.0)
         except subprocess.TimeoutExpired:
