@@ -18,6 +18,7 @@ from .test_scene_body import world_vertices
 
 FRAMES, TRIES = 12, 3
 MOST_S = 8e-3  # CPU time of a frame of a whole body; measured 1.5 to 4 ms, and 150 ms with the metaballs
+MOST_SHARE = 0.08  # of that with the metaballs, where other work makes all of it slower
 
 
 @pytest.fixture
@@ -30,10 +31,10 @@ def whole_body(tmp_path: Path) -> Path:
     return out
 
 
-def frame_s(scene: object) -> float:
+def frame_s(scene: object, tries: int = TRIES) -> float:
     """CPU time of one frame: the median of the frames after the first, in the quietest of some tries."""
     medians = []
-    for _ in range(TRIES):
+    for _ in range(tries):
         scene.frame_set(0)
         taken = []
         for frame in range(1, FRAMES):
@@ -57,7 +58,7 @@ def test_a_whole_body_plays_fast_until_its_metaballs_are_shown(blender: ModuleTy
     scene = empty.context.scene
     parts = {o.name for o in empty.data.objects if o.type == "META"}
     assert len(parts) > 30 and seen(empty) == set() and not scene.tricap.show_metaballs
-    assert frame_s(scene) <= MOST_S
+    hidden_s = frame_s(scene)
     skin = empty.data.objects["Skin"]
     scene.frame_set(0)
     before = world_vertices(empty, skin)
@@ -66,8 +67,10 @@ def test_a_whole_body_plays_fast_until_its_metaballs_are_shown(blender: ModuleTy
     scene.tricap.show_metaballs = True
     assert seen(empty) == parts and scene.tricap.show_metaballs
     assert len(world_vertices(empty, empty.data.objects["Flesh pelvis"])) > 100
+    shown_s = frame_s(scene, 1)
     scene.tricap.show_metaballs = False
-    assert seen(empty) == set() and frame_s(scene) <= MOST_S
+    assert seen(empty) == set()
+    assert max(hidden_s, frame_s(scene)) <= max(MOST_S, MOST_SHARE * shown_s), f"{shown_s:.3f} s with the metaballs"
 
 
 def test_the_switch_is_undone_saved_and_for_every_view_layer(
