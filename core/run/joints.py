@@ -19,7 +19,7 @@ from ..foundation.progress import Monitor
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import NothingMeasured, measure_frames
-from ..surface.resolution import measured_footage
+from ..surface.resolution import measured_footage, shows_enough
 from ..surface.starts import MeasureSettings
 from ..take.footage import Footage, open_take
 from ..take.take import FrameClicks, Take, read_take
@@ -74,6 +74,8 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
         with tempfile.TemporaryDirectory() as folder, Results(Path(folder)).opened() as results:
             try:
                 part = monitor.part("surface", i, len(chosen))
+                if small is not one and not shows_enough(small, MeasureSettings.of(settings), results, frame, part):
+                    small = one
                 for found in measure_frames(small, MeasureSettings.of(settings), results, part, frame):
                     measured[frame] = found.cloud
             except NothingMeasured:

@@ -237,8 +237,7 @@ def is_complete(run: Run) -> bool:
     done = run.record["stages"]
     body = () if "not_done" in done.get("fit", {}) else BODY_FILES[:3]
     surface = () if "not_done" in done.get("measure", {}) else ("clouds", "trajectories.npz")
-    files = ("report", *surface, *body)
-    there = {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in files)
+    there = {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in ("report", *surface, *body))
     return there and (not body or can_be_read(run.results))
 
 
@@ -252,6 +251,7 @@ def _does_without_surface(run: Run) -> bool:
 
 def _measured_from_somewhere(run: Run, summaries: list[FrameSummary], kept: set[int], monitor: Monitor) -> Foreground | None:
     """As `_measure_frames`; if the first frame shows hardly anything, for no certain cause, from another one, or with pairs of views."""
+    run.choose_image_size(monitor)
     try:
         return _measure_frames(run, summaries, kept, monitor)
     except NothingMeasured as error:

@@ -14,7 +14,7 @@ from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
 from ..foundation import store
 from ..foundation.errors import InputError
-from ..foundation.progress import Cancelled
+from ..foundation.progress import Cancelled, Monitor
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
 from ..results import blend_file, films
@@ -22,7 +22,8 @@ from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..results.own_files import files_of
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
-from ..surface.resolution import measured_footage
+from ..surface.resolution import measured_footage, shows_enough
+from ..surface.starts import MeasureSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
 from ..take.take import Take, read_take
@@ -37,6 +38,7 @@ from .stages import CONTENT, STAGE_FILES, STAGE_INPUTS, STAGES, STAMPED, known_k
 
 SURFACE = "surface"  # of the measured stage in run.json: the digest of the keys of its frames, with the content of their images
 OTHER_IMAGES = "The images are not those that were measured before; tracks and body of these were removed."
+IN_FULL_SIZE = "The images are measured in full size, for reduced ones show next to nothing; that takes longer."
 REPLACED = "Images or other files of the take were replaced or removed during this run, so its results do not fit each other. Run it again."
 FIT_STEPS = ("cache/fit_rough", "cache/fit", "cache/fit_again")  # checkpoints of a fit under way
 FITTED = "cache/body"
@@ -70,11 +72,24 @@ class Run:
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
+        if self.record["stages"].get("measure", {}).get("reduction") == 1.0 and self.measured_footage is not self.footage:
+            self._measure_in_full_size()
 
     @property
     def measured_footage(self) -> Footage:
         """The footage at the size at which its surface is measured and tracked."""
         return measured_footage(self.footage, self.settings["surface"].quality, self.settings["growing"].spacing_px)
+
+    def choose_image_size(self, monitor: Monitor) -> None:
+        """Measure the images as they are, not reduced, if the reduced ones show next to nothing and none were measured before."""
+        small = self.measured_footage
+        if small is not self.footage and "measure" not in self.record["stages"]:
+            if not shows_enough(small, MeasureSettings.of(self.settings), self.results, self.begin, monitor):
+                self._measure_in_full_size()
+
+    def _measure_in_full_size(self) -> None:
+        self.settings["surface"] = replace(self.settings["surface"], quality="surface")
+        self.warn(IN_FULL_SIZE)
 
     @property
     def clouds(self) -> Sequence[PointCloud]:

@@ -31,7 +31,7 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import SurfaceSettings
 
-ALGORITHM = "surface 28"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 29"  # part of every key: raise it when the same input gives other numbers
 SEED_PX = 0.3  # precision of a seed in the images
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before

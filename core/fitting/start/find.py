@@ -192,7 +192,8 @@ def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Seq
         points = points_of(t)
         if len(points.xyz_m) >= LEAST_POINTS:
             ease[t] = _ease(fit, t, points)
-    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if framing(fit.seen(t, points_of(t)), middle) is shown), None)
+    accepted = {shown, Framing.CUT} if shown is Framing.UPPER and fit.clicked else {shown}  # what a person clicks is somebody
+    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if framing(fit.seen(t, points_of(t)), middle) in accepted), None)
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:

@@ -11,7 +11,7 @@ from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.results.run_json import read_run
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.run.inspection import patch_boxes, read_points, read_removed
 from tricap.core.run.take_run import Run, open_run
 from tricap.core.surface import resolution
@@ -106,6 +106,20 @@ def test_a_reduced_image_gives_fewer_points_as_good_in_full_pixels(large_take: P
     assert np.nanmedian(moved, axis=0) == pytest.approx([0.008, 0.0, 0.0], abs=8e-4)
     assert read_run(tmp_path / "motion" / "run.json")["stages"]["measure"]["reduction"] == pytest.approx(FACTOR, rel=0.1)
     assert read_run(tmp_path / "surface" / "run.json")["stages"]["measure"]["reduction"] == 1
+
+
+def test_images_that_show_nothing_when_they_are_reduced_are_measured_as_they_are(
+    large_take: Path, few_points: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resolution, "LEAST_SHARE", 10.0)
+    run = _tracked(large_take, tmp_path / "out")
+    assert run.measured_footage is run.footage and take_run.IN_FULL_SIZE in run.record["warnings"]
+    assert run.record["stages"]["measure"]["reduction"] == 1
+    whole = {path: path.read_bytes() for path in (tmp_path / "out" / "cache" / "surface").iterdir()}
+    monkeypatch.setattr(take_run, "shows_enough", None)  # decided once
+    again = _tracked(large_take, tmp_path / "out")
+    assert again.measured_footage is again.footage and take_run.IN_FULL_SIZE in again.record["warnings"]
+    assert whole == {path: path.read_bytes() for path in (tmp_path / "out" / "cache" / "surface").iterdir()}
 
 
 def test_checkpoints_of_reduced_images_are_shown_in_full_pixels(large_take: Path, few_points: None, tmp_path: Path) -> None:
