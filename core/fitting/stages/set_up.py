@@ -125,6 +125,12 @@ def of_model(given: FitInput, model: str) -> FitInput:
     return replace(given, model=model, limits=limits, locked=tuple(name for name in given.locked if name in dofs))
 
 
+def _starts_by_clicks(given: FitInput, settings: FitSettings) -> bool:
+    """Whether the clicked joints suffice for the smallest model that has them."""
+    located = _located_joints(given, settings)
+    return bool(located) and not needs_start(of_model(given, smallest_model(located)), settings)
+
+
 def _located_joints(given: FitInput, settings: FitSettings) -> set[str]:
     """The joints of keypoints, and those that are clicked in two views."""
     names = read_model(WHOLE_BODY).skeleton.joint_names
@@ -161,7 +167,10 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
     def points_of(t: int) -> CloudPoints:
         return thinned(clouds[t], settings.voxel_m)
 
-    for shown, model in PERSONS.items():
+    shown_of = {model: {shown} for shown, model in PERSONS.items()}
+    if given.clicks and given.model in (AUTO_BODY, PERSONS[Framing.UPPER]) and not _starts_by_clicks(given, settings):
+        shown_of[PERSONS[Framing.UPPER]].add(Framing.CUT)  # what people click is a person, even if other borders cut it
+    for model, shown in shown_of.items():
         if given.model == WHOLE_BODY != model:
             break  # a whole body is not begun by a part of it
         fit = replace(_without_start(of_model(given, model), settings, points_of), monitor=monitor)

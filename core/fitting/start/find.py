@@ -20,7 +20,7 @@ Where an arm lies on the body is hardly seen in one frame: an adjustment that be
 Wrists therefore have a larger sigma (`StartJoints.sigma_m`).
 """
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,10 +101,10 @@ def find_start(
     frames: Sequence[int],
     time_s: np.ndarray,
     monitor: Monitor,
-    shown: Framing,
+    shown: Collection[Framing],
     without: tuple[str, ...] = (),
 ) -> StartJoints | None:
-    """The joints where the fit begins; None where no frame has enough points and shows so much of the person as `shown`.
+    """The joints where the fit begins; None where no frame has enough points and shows as much of the person as one of `shown`.
 
     `fit`: a body of that part, without the joints of clicks as a start. `points_of(t)`: the points of frame index
     t. `without`: recordings of the pose dictionary that are left out.
@@ -166,7 +166,11 @@ def _everywhere(
 
 
 def easiest_frames(
-    fit: FitContext, points_of: Callable[[int], CloudPoints], time_s: np.ndarray, monitor: Monitor, shown: Framing = Framing.WHOLE
+    fit: FitContext,
+    points_of: Callable[[int], CloudPoints],
+    time_s: np.ndarray,
+    monitor: Monitor,
+    shown: Collection[Framing] = (Framing.WHOLE,),
 ) -> list[int]:
     """The frame indices to search: the easiest one, of those with clicks if there are any, then the easiest ones around it (`AROUND_S`).
 
@@ -185,15 +189,16 @@ def _spread(rows: np.ndarray, count: int) -> list[int]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))].tolist()
 
 
-def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Sequence[int], monitor: Monitor, shown: Framing) -> int | None:
+def _easiest(
+    fit: FitContext, points_of: Callable[[int], CloudPoints], some: Sequence[int], monitor: Monitor, shown: Collection[Framing]
+) -> int | None:
     ease, middle = dict[int, float](), fit.cameras[len(fit.cameras) // 2]
     for t in some:
         monitor.check()
         points = points_of(t)
         if len(points.xyz_m) >= LEAST_POINTS:
             ease[t] = _ease(fit, t, points)
-    accepted = {shown, Framing.CUT} if shown is Framing.UPPER and fit.clicked else {shown}  # what a person clicks is somebody
-    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if framing(fit.seen(t, points_of(t)), middle) in accepted), None)
+    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if framing(fit.seen(t, points_of(t)), middle) in shown), None)
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:

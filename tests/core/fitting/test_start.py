@@ -188,6 +188,22 @@ def test_an_upper_body_is_found_where_the_image_cuts_the_person(quick, monkeypat
     assert with_start(replace(given, model="arm.R"), SETTINGS, Monitor()).model == "arm.R"
 
 
+def test_a_click_finds_a_person_whom_other_borders_cut_but_not_instead_of_a_clicked_limb(quick, monkeypatch) -> None:
+    """Something that moves at the border of the image counts as the person until somebody says where that is."""
+    monkeypatch.setattr(find, "framing", lambda *_: search.Framing.CUT)
+    given, pose = _cut()
+    joints, cameras = dict(zip(NAMES, _joints(pose))), given.rig.cameras
+
+    def clicked(*names: str) -> FitInput:
+        return replace(given, clicks={0: {name: {c.name: c.project(joints[name]) for c in cameras} for name in names}})
+
+    assert find_joints(given, SETTINGS, Monitor(), RARE) is None
+    found = find_joints(clicked("shoulder.L"), SETTINGS, Monitor(), RARE)
+    assert found is not None and found.model == "upper_body"
+    assert np.linalg.norm(found.xyz_m["shoulder.L"] - joints["shoulder.L"]) < 0.05
+    assert find_joints(clicked("shoulder.R", "elbow.R", "wrist.R"), SETTINGS, Monitor(), RARE) is None
+
+
 def test_without_a_model_clicks_on_a_limb_choose_it(monkeypatch) -> None:
     given, joints = _input(_pose(0.0), model=AUTO_BODY), dict(zip(NAMES, _joints(_pose(0.0))))
     monkeypatch.setattr(set_up, "find_joints", lambda *_: None)
