@@ -263,7 +263,7 @@ def contents(out: Path) -> dict[str, bytes]:
             run = json.loads(data)
             for stage in run["stages"].values():
                 stage.pop("seconds")
-            run.get("files", {}).pop("report/report.html", None)
+            run.get("files", {}).pop("report", None)
             run.pop("blend", None)
             data = json.dumps(run).encode()
         elif name.startswith("report/") and path.suffix in (".html", ".json"):

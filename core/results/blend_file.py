@@ -31,7 +31,7 @@ def keep_edited(folder: Path) -> str:
     if path.is_symlink() or not path.is_file() or _as_written(path):
         return ""
     try:
-        kept = store.rename_to_free(path, _names(path))
+        kept = store.rename_to_free(path, edited_names(path))
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"Cannot rename {path}: {reason}. Close the program that uses it, or choose another folder.") from error
@@ -82,6 +82,7 @@ def _digest(path: Path) -> str:
     return store.digest(path, largest=bounded.ARRAYS_BYTES)
 
 
-def _names(path: Path) -> Iterator[Path]:
-    yield path.with_name(f"{path.stem} (edited).blend")
-    yield from (path.with_name(f"{path.stem} (edited {n}).blend") for n in count(2))
+def edited_names(path: Path) -> Iterator[Path]:
+    """Names for a file of which there is a new version and that was edited, the first choice first."""
+    yield path.with_stem(f"{path.stem} (edited)")
+    yield from (path.with_stem(f"{path.stem} (edited {n})") for n in count(2))

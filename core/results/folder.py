@@ -31,7 +31,7 @@ MADE_BY = {  # what of them the stages write, and others need
     "measure": ("clouds",),
     "track": ("trajectories.npz", "trajectories_raw.npz", "tracked"),
     "fit": ("joints.csv", "motion.csv", "body.toml", "frames.csv", "skin"),
-    "report": ("report/report.html",),
+    "report": ("report",),
 }
 
 MOST_ROW = 1 << 16  # bytes of a row of a table

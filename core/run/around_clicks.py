@@ -34,6 +34,7 @@ from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..motion.formats.ply import write_mesh
 from ..motion.tables import JointTable, MotionTable, read_joints, read_motion, write_joints, write_motion
+from ..results import edited_tables
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import last_cloud
@@ -126,9 +127,12 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
         for i, rows in enumerate(stretches):
             joints = {name for frame, names in changed.items() if frame in body.motion.frames[rows] for name in names}
             parts.append(_fitted(footage, results, settings, body, rows, joints, monitor.part("fit", i, len(stretches))))
+        edited = edited_tables.edited(results.folder, record["stages"])  # their edits stay in them
         _write(results, settings["skin"], body, parts)
         again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
         record["stages"]["fit"] |= {FITTED_WITH: {**before, **now}, AGAIN: again}
+        if noted := record["stages"]["fit"].get(edited_tables.ENTRY):
+            noted |= {name: digest for name, digest in edited_tables.digests(results.folder).items() if name not in edited}
         results.write_run(record)
         written = _Body.read(results, body.model)
     frames = np.concatenate([part.frames for part in parts])

@@ -135,7 +135,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     """
     _prepare_fit(run, monitor)
     began = time.perf_counter()
-    run.results.remove(*BODY_FILES)
+    run.remove_body(BODY_FILES)
     run.warn(*clicks_left_out(run.footage))
     if missing := missing_for_fit(run.footage):
         return _no_body(run, missing, began)

@@ -17,7 +17,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
-from ..results import blend_file, films
+from ..results import blend_file, edited_tables, films
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..results.own_files import files_of
 from ..surface.cloud import PointCloud
@@ -110,7 +110,8 @@ class Run:
         before = self.record["stages"].get(stage, {})
         same = {name: before[name] for name in (CONTENT, STAMPED) if name in before and before.get("key") == key}
         by_content = {CONTENT: self.content_keys[stage]} if stage in self.content_keys else {}
-        entry = {"seconds": round(time.perf_counter() - began, 2), "key": key, **same, **by_content, **figures}
+        written = {edited_tables.ENTRY: edited_tables.digests(self.results.folder)} if stage == "fit" else {}
+        entry = {"seconds": round(time.perf_counter() - began, 2), "key": key, **same, **by_content, **written, **figures}
         stages = self.record["stages"] | {stage: entry}
         self.record["stages"] = {name: stages[name] for name in MADE_BY if name in stages}  # one made again is no longer the last
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
@@ -131,6 +132,11 @@ class Run:
         self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in dropped}
         names = [name for stage in after for name in STAGE_INPUTS[stage].files]
         self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *FIT_STEPS, FITTED])]
+
+    def remove_body(self, names: Sequence[str]) -> None:
+        """Remove the body's files; what was edited gets another name."""
+        self.notes += edited_tables.keep(self.results.folder, self.record["stages"])
+        self.results.remove(*names)
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
@@ -210,6 +216,8 @@ def open_run(
             record, incomplete = new_record(footage, settings) | {drawn_outlines.ENTRY: outlines}, lost(results.folder, before)
             record |= {name: before[name] for name in (blend_file.DIGESTS, films.ENTRY) if name in before}
             record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
+            if "fit" not in record["stages"]:
+                notes += edited_tables.keep(results.folder, _recorded(results).get("stages", {}))
             notes += _remove_all(results) if restart else _remove_stale(results, before, kept)
             if record["stages"].keys() != before.get("stages", {}).keys():  # a run that is stopped leaves no word of what is made again
                 results.write_run(record)

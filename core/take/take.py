@@ -59,6 +59,7 @@ KEYS = (
     "preset",
     "quality",
 )
+LONGEST_NAME = 120  # bytes of a view's name: a file's may have 255, and other words stand before and behind it
 TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys of take.toml itself, and their groups
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
@@ -294,6 +295,8 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
             raise InputError(f"`offset_frames` of {label} is {shown(offset)}; write a whole number of frames, such as -2.")
         if not bounded.fits_file_names(entry["name"]):  # it is used in file names
             raise InputError(f'The {label} has a name, or a character in its name, that no file may have; choose a plain name such as "L".')
+        if len(entry["name"].encode()) > LONGEST_NAME:
+            raise InputError(f"The {label} has a name that is too long for the files that are named after it; choose a shorter one.")
         if sorted(map(type, (entry.get("images"), entry.get("movie"))), key=str) != [type(None), str]:
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         check_pattern(entry.get("images"), label)

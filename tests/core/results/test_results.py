@@ -185,22 +185,27 @@ def test_removing(tmp_path: Path) -> None:
 
 def test_what_was_written_and_is_gone_or_cut_is_known(tmp_path: Path) -> None:
     results = Results(tmp_path)
-    for name in ("clouds/0000.ply", "clouds/0001.ply", "joints.csv", "skin/0000.ply", "skin/texture.png", "report/report.html"):
+    for name in (
+        "clouds/0000.ply",
+        "clouds/0001.ply",
+        "joints.csv",
+        "skin/0000.ply",
+        "skin/texture.png",
+        "report/report.html",
+        "report/figures.csv",
+    ):
         store.write_bytes(tmp_path / name, b"some bytes")
     results.write_run({"stages": {}})
     run = results.read_run()
-    assert (
-        run["files"] == {"clouds": [2, 20], "joints.csv": [1, 10], "skin": [2, 20], "report/report.html": [1, 10]}
-        and lost(tmp_path, run) == {}
-    )
+    assert run["files"] == {"clouds": [2, 20], "joints.csv": [1, 10], "skin": [2, 20], "report": [2, 20]} and lost(tmp_path, run) == {}
     (tmp_path / "clouds" / "Thumbs.db").write_bytes(b"of the system")
     (tmp_path / "skin" / ".DS_Store.png").write_bytes(b"of the system")
     (tmp_path / "clouds" / "0002.ply").write_bytes(b"more harms nothing")
     assert lost(tmp_path, run) == {} and lost(tmp_path, {"stages": {}}) == {}, "and an earlier version does not know"
     (tmp_path / "joints.csv").write_bytes(b"cut")
     (tmp_path / "skin" / "texture.png").unlink()
-    (tmp_path / "report" / "report.html").unlink()
-    assert lost(tmp_path, run) == {"fit": ["joints.csv", "skin"], "report": ["report/report.html"]}
+    (tmp_path / "report" / "figures.csv").unlink()
+    assert lost(tmp_path, run) == {"fit": ["joints.csv", "skin"], "report": ["report"]}
     run["frames"], rows = [0, 3], ["frame,x\r\n", "0,1.5\r\n", "1,1.5\r\n", "2,1\r\n"]
     run["files"]["joints.csv"] = [1, 100]
     for kept, complete in ((rows, True), (rows[:-1], False), ([*rows[:-1], "2,1"], True), ([*rows[:-1], "2\r\n"], False), ([], False)):

@@ -14,6 +14,7 @@ import pytest
 from tricap.core.cli import main
 from tricap.core.foundation import store
 from tricap.core.foundation.progress import Monitor
+from tricap.core.results import edited_tables
 from tricap.core.run import pipeline, take_run
 from tricap.core.run import settings as run_settings
 from tricap.core.run.check import check_run
@@ -299,6 +300,25 @@ def test_results_of_another_take_are_kept_without_a_body_too(plane_take: Path, t
     assert main.main(["batch", str(other), "--out", str(tmp_path / "out"), "--workers", "1", *given[:2]]) != 0
     assert "has results of another take" in "".join(capfd.readouterr())
     assert clouds == {path: path.read_bytes() for path in (out / "clouds").iterdir()}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_what_was_edited_of_a_fit_is_kept_when_it_is_made_again(plane_take: Path, tmp_path: Path, restart: bool) -> None:
+    """Edits of motion.csv and of the texture were lost without a word with the next change of a setting."""
+    out, given = tmp_path / "out", {"growing": {"spacing_px": 16}}
+    pipeline.run(plane_take, out, given, frames=(0, 2))
+    for name in edited_tables.EDITABLE:
+        store.write_bytes(out / name, b"as the fit wrote it")
+    record = json.loads((out / "run.json").read_text())
+    record["stages"]["fit"][edited_tables.ENTRY] = edited_tables.digests(out)
+    (out / "run.json").write_text(json.dumps(record))
+    for name in ("motion.csv", "skin/texture.png"):
+        (out / name).write_bytes(b"edited")
+    with take_run.open_run(plane_take, out, {"growing": {"spacing_px": 16}, "skin": {"relief": False}}, (0, 2), restart=restart) as job:
+        assert (out / "motion (edited).csv").read_bytes() == (out / "skin" / "texture (edited).png").read_bytes() == b"edited"
+        assert not any((out / name).exists() for name in edited_tables.EDITABLE)
+        assert len(job.notes) == 2 and "is kept as “motion (edited).csv”" in job.notes[0]
+    assert len([*out.rglob("*(edited*")]) == 2  # the others were not edited
 
 
 def test_a_run_without_a_body_is_replaced_without_a_question(plane_take: Path, tmp_path: Path) -> None:

@@ -157,6 +157,10 @@ FAULTS = {
     "view with a line in its name": (text(views=VIEWS + '[[views]]\nname = "a\\nb"\nimages = "x"\n'), "a character in its name"),
     "a date for a number": (text({"fps": "1979-05-27T07:32:00Z"}), "`fps` of .* is 1979-05-27 07:32:00\\+00:00; write"),
     "a truth for a number": (text({"fps": "true"}), "`fps` of .* is true; write"),
+    "view with a long name": (
+        text(views=VIEWS + f'[[views]]\nname = "{"é" * 61}"\nimages = "x"\n'),
+        "too long for the files that are named after it",
+    ),
     "view that Windows takes for a device": (text(views=VIEWS + '[[views]]\nname = "con"\nimages = "x"\n'), "that no file may have"),
     "view with a blank at its end": (text(views=VIEWS + '[[views]]\nname = "side "\nimages = "x"\n'), "that no file may have"),
     "two views alike but for capitals": (text(views=VIEWS + '[[views]]\nname = "l"\nimages = "x"\n'), "differ only in capitals"),
