@@ -1,4 +1,4 @@
-"""Enabling the add-on loads neither stages nor builders nor scipy, and takes little time (CPU seconds, the lowest of three starts)."""
+"""Enabling the add-on loads neither stages nor builders nor scipy, and takes less time than Blender itself needs to be loaded."""
 
 import importlib.util
 import os
@@ -10,12 +10,16 @@ import pytest
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed for this Python")
 CODE = """
-import os, sys, time, bpy, tricap
+import os, sys, time
+began = time.process_time()
+import bpy
+blender_s = time.process_time() - began
+import tricap
 before, began = set(sys.modules), time.process_time()
 tricap.register()
 if "work" in sys.argv:
     from tricap.core.run import pipeline
-print(time.process_time() - began, *(set(sys.modules) - before), flush=True)
+print(time.process_time() - began, blender_s, *(set(sys.modules) - before), flush=True)
 os._exit(0)  # Blender 4.5 as a module crashes as it ends with the add-on registered"""
 HEAVY = {
     "scipy",
@@ -33,26 +37,27 @@ HEAVY = {
     "tricap.core.synchronising.synchronise",
     "tricap.core.tracking.track",
 }
-LIMIT_S = 0.4  # twice what it takes on an idle machine, with the bytecode that the first start wrote
+STARTS = 3  # of which the quickest counts; the bytecode was written by an earlier one
 
 
-def start(bytecode: Path, *arguments: str) -> tuple[float, set[str]]:
-    """The CPU time [s] of registering in a new process, and the modules that it loads."""
+def start(bytecode: Path, *arguments: str) -> tuple[float, float, set[str]]:
+    """The CPU times [s] of registering in a new process and of importing bpy there, and the modules that registering loads."""
     variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     variables["PYTHONPYCACHEPREFIX"] = str(bytecode)
     done = subprocess.run([sys.executable, "-c", CODE, *arguments], capture_output=True, text=True, check=True, env=variables)
-    seconds, *modules = done.stdout.splitlines()[-1].split()
-    return float(seconds), set(modules)
+    seconds, blender_s, *modules = done.stdout.splitlines()[-1].split()
+    return float(seconds), float(blender_s), set(modules)
 
 
 @pytest.mark.slow
 def test_enabling_loads_no_stage_and_is_quick(tmp_path: Path) -> None:
-    _, modules = start(tmp_path)
+    modules = start(tmp_path)[-1]
     assert "tricap.core.run.settings" in modules
     assert not modules & HEAVY
-    assert min(start(tmp_path)[0] for _ in range(3)) < LIMIT_S
+    seconds, blender_s, _ = zip(*(start(tmp_path) for _ in range(STARTS)), strict=True)
+    assert min(seconds) < min(blender_s)  # measured a third to 0.6 of it, idle and busy
 
 
 @pytest.mark.slow
 def test_a_loaded_stage_is_found_out(tmp_path: Path) -> None:
-    assert {"tricap.core.run.pipeline", "tricap.core.run.record", "tricap.core.tracking.track"} <= start(tmp_path, "work")[1]
+    assert {"tricap.core.run.pipeline", "tricap.core.run.record", "tricap.core.tracking.track"} <= start(tmp_path, "work")[-1]
