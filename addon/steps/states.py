@@ -13,7 +13,6 @@ import bpy
 
 from ...core.body.model_file import read_model
 from ...core.body.motion import GUESSED, INFERRED
-from ...core.fitting.settings import START_ALONE
 from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
@@ -22,7 +21,7 @@ from ...core.results.run_json import read_run
 from ...core.run.settings import settings_of
 from ...core.take.clicked_points import clicked_depth
 from ...core.take.footage import Footage, footage_frames, open_take
-from ...core.take.take import AUTO_BODY, Take
+from ...core.take.take import AUTO_BODY, START_ALONE, Take
 from .. import folders, project
 from ..clicking.click_session import joints_of as joints_in_order
 from ..scene import stored

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..body.model_file import read_model
 from ..fitting.inputs.take_inputs import clicks_of_no_joint
-from ..fitting.settings import START_ALONE, FitSettings
+from ..fitting.settings import FitSettings
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -22,7 +22,7 @@ from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
-from ..take.take import Take, read_take
+from ..take.take import START_ALONE, Take, read_take
 from ..tracking.corrections import odd_regions
 from .findings import Cause, Checked, Finding, doubtful, remark, wrong
 from .openings import opening_findings

@@ -15,8 +15,8 @@ from ..results.run_json import UNTIL, notes_of
 from ..run import pipeline, take_run
 from ..run.engine import Engine, of_this_machine
 from ..run.settings import settings_of
-from ..surface.resolution import measured_footage
-from ..surface.starts import MeasureSettings, first_seeds
+from ..surface.resolution import measured_footage, person_seen
+from ..surface.starts import MeasureSettings, first_frame, first_seeds
 from ..synthetic.arm import PERSON, ArmTakeSettings, is_arm_take, make_arm_take
 from ..synthetic.score import score_run
 from ..take.footage import open_take
@@ -32,9 +32,11 @@ def seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     take = read_take(args.take)
     settings = settings_of(take.settings, overrides(args.set), str(args.take))
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
-    frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
-    measured = measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
-    where, found = first_seeds(measured, MeasureSettings.of(settings), frame, monitor)
+    measuring = MeasureSettings.of(settings)
+    person = person_seen(footage, measuring, monitor)
+    measured = measured_footage(footage, measuring, person.distance_m if person else None)
+    frame = first_frame(measured)
+    where, found = first_seeds(measured, measuring, frame, monitor)
     near, far = where.depth_range_m
     args.always_shown = [
         f"Frame {frame}: {len(found.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "

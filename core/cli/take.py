@@ -5,12 +5,12 @@ from pathlib import Path
 
 from ..body.model_file import read_model
 from ..calibration.rig_files import read_any
-from ..fitting.settings import START_ALONE
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..images.sequence import movie_rate
 from ..take.bar_file import read_bar, write_bar
+from ..take.take import START_ALONE
 from ..take.writing import ASSUMED_FPS, footage_entry, make_take, new_table, take_of_table
 
 

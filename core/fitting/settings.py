@@ -6,7 +6,6 @@ from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
 ALGORITHM = "body 26"  # part of the fit's key: raise it when the same input gives another body
-START_ALONE = ("auto", "full", "upper_body")  # models whose joints need no clicks; a limb starts alone where its person is visible
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

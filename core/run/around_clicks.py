@@ -39,6 +39,7 @@ from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import last_cloud
 from ..take.footage import Footage, open_take
+from ..take.surface_clicks import surface_clicks
 from ..take.take import AUTO_BODY, FrameClicks, Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import read_trajectories
@@ -82,7 +83,8 @@ def fitted_with(footage: Footage, settings: Mapping[str, Any], out: Path) -> dic
 
 def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp | None = None) -> str:
     """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file, by default its time."""
-    take = replace(footage.take, clicks=replace(footage.take.clicks, joints={}), keyframes=())
+    followed = surface_clicks(footage.take, automatic_seeds=settings["growing"].seed_spacing_px > 0)
+    take = replace(footage.take, clicks=replace(followed, joints={}), keyframes=())
     return stage_keys(replace(footage, take=take), settings, out, stamp)["fit"]
 
 

@@ -19,7 +19,7 @@ from ..foundation.progress import Monitor
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import NothingMeasured, measure_frames
-from ..surface.resolution import measured_footage, shows_enough
+from ..surface.resolution import measured_footage, person_seen, shows_enough
 from ..surface.starts import MeasureSettings
 from ..take.footage import Footage, open_take
 from ..take.take import FrameClicks, Take, read_take
@@ -67,16 +67,17 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
     shortly = min(round(SHORTLY_S * footage.take.fps), len(frames) - 1)
     places = np.linspace(frames.start, frames.stop - 1 - shortly, PLACES).round().astype(int)
     chosen = clicked or np.unique([places, places + shortly]).tolist()
-    measured = dict[int, PointCloud]()
+    measured, measuring = dict[int, PointCloud](), MeasureSettings.of(settings)
+    person = person_seen(footage, measuring, monitor)
     for i, frame in enumerate(chosen):
-        one = only_frames(footage, (frame, frame + 1))
-        small = measured_footage(one, settings["surface"].quality, settings["growing"].spacing_px)
+        one = measured_footage(only_frames(footage, (frame, frame + 1)), measuring, None)
+        small = measured_footage(one, measuring, person.distance_m if person else None)
         with tempfile.TemporaryDirectory() as folder, Results(Path(folder)).opened() as results:
             try:
                 part = monitor.part("surface", i, len(chosen))
-                if small is not one and not shows_enough(small, MeasureSettings.of(settings), results, frame, part):
+                if small.full_size_px and not shows_enough(small, measuring, results, frame, part):
                     small = one
-                for found in measure_frames(small, MeasureSettings.of(settings), results, part, frame):
+                for found in measure_frames(small, measuring, results, part, frame):
                     measured[frame] = found.cloud
             except NothingMeasured:
                 continue  # the person may enter later

@@ -106,7 +106,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         *check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor)
     )
     run.note_surface(surface := store.digest(*(summary.key for summary in summaries)))
-    figures = surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean()))
+    figures = surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean()), run.distance_m)
     run.finish_stage("measure", began, **figures, **{SURFACE: surface})
 
 

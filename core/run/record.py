@@ -49,9 +49,11 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | None, reduction: float) -> dict[str, Any]:
-    """Figures of the measured frames: number, points, residuals, sigma, how the person was separated from the background, and by which
-    factor the images were reduced."""
+def surface_figures(
+    summaries: Sequence[FrameSummary], foreground: Foreground | None, reduction: float, distance_m: float | None
+) -> dict[str, Any]:
+    """Figures of the measured frames: number, points, residuals, sigma, how the person was separated from the background, by which factor
+    the images were reduced, and for a person at which distance [m]; None: at any."""
     return {
         "frames": len(summaries),
         "points_per_frame": float(np.mean([f.points for f in summaries])),
@@ -60,6 +62,7 @@ def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | 
         "foreground": foreground.method if foreground else "",
         "background_planes": len(foreground.planes) if foreground else 0,
         "reduction": round(reduction, 3),
+        "distance_m": distance_m,
     }
 
 

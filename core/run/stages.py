@@ -21,6 +21,7 @@ from ..foundation.settings import to_table
 from ..results.films import FILMS
 from ..surface import starts
 from ..take.footage import Footage
+from ..take.surface_clicks import surface_clicks
 from ..take.take import NO_BODY, FrameClicks, Take, View
 from ..tracking import track
 from .file_digests import reads_content
@@ -38,22 +39,29 @@ class StageInput:
     """The inputs and files of a stage that no earlier stage has."""
 
     settings: tuple[str, ...]  # groups of knobs
-    take: Callable[[Footage, Stamp], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
+    take: Callable[
+        [Footage, Mapping[str, Any], Stamp], Any
+    ]  # by settings, the parts of take.toml, rig.toml and the footage, as values with a `repr`
     files: tuple[str, ...]  # results in OUT, which a run removes once they are stale
 
 
-def _measure_input(footage: Footage, stamp: Stamp) -> Any:
-    """The images, the cameras, and the person's masks."""
+def _measure_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) -> Any:
+    """The images, the cameras, the person's masks, and the clicks that the surface follows."""
     take = footage.take
+    clicks = _followed(take, settings)
     regions = [c for c in _corrections(take) if c[0] == "region"]
     views = [(v.name, v.offset_frames, *v.clock, *_timestamps(take, v, stamp)) for v in take.views]
     files = [[stamp(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
     person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v, stamp)) for v in take.views]
-    swept: tuple[float | str, ...] = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
+    swept: tuple[float | str, ...] = (footage.click_sigma_px,) if clicks.surface else ()  # how far about the clicked surface
     swept += footage.unlike_views
-    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, starts.ALGORITHM, *swept
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(clicks), regions, person, starts.ALGORITHM, *swept
+
+
+def _followed(take: Take, settings: Mapping[str, Any]) -> FrameClicks:
+    return surface_clicks(take, automatic_seeds=settings["growing"].seed_spacing_px > 0)
 
 
 def _timestamps(take: Take, view: View, stamp: Stamp) -> tuple[Any, ...]:
@@ -65,21 +73,22 @@ def _person_files(take: Take, view: View, stamp: Stamp) -> Any:
     return [stamp(path) for path in sorted(bounded.matching(take.folder, pattern))] if pattern else []
 
 
-def _track_input(footage: Footage, stamp: Stamp) -> Any:
+def _track_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) -> Any:
     return footage.take.fps, [c for c in _corrections(footage.take) if c[0] == "trajectory"], track.ALGORITHM
 
 
-def _fit_input(footage: Footage, stamp: Stamp) -> Any:
+def _fit_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) -> Any:
     take = footage.take
     model = take.body_model or NO_BODY
     own = store.digest(*model_files(model)) if model.endswith(".toml") else ""
     named = Path(model).name if own else model
+    others = [] if _followed(take, settings) is take.clicks else [_clicked(take.clicks)]  # the key of the surface lacks them
     return (
         named,
         own,
         tuple(sorted(take.locked)),
         sorted(take.limits.items()),
-        [_clicked(k) for k in take.keyframes],
+        others + [_clicked(k) for k in take.keyframes],
         _keypoints(take, stamp),
         ALGORITHM,
     )
@@ -128,7 +137,7 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: 
     try:
         stamp = stamp or stamp_for(footage)
         for stage, own in STAGE_INPUTS.items():
-            inputs = [settings[name] for name in own.settings], own.take(footage, stamp)
+            inputs = [settings[name] for name in own.settings], own.take(footage, settings, stamp)
             before = keys[stage] = store.digest(before, repr(inputs))
         contours = sorted((out / "contours").glob("*.csv"))
         keys["fit"] += f" {store.digest(*contours, largest=bounded.TABLE_BYTES)}" if contours else ""

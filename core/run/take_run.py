@@ -22,7 +22,7 @@ from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..results.own_files import files_of
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
-from ..surface.resolution import measured_footage, shows_enough
+from ..surface.resolution import clicked_distance_m, measured_footage, person_seen, shows_enough
 from ..surface.starts import MeasureSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
@@ -62,6 +62,8 @@ class Run:
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
+    distance_m: float | None = None  # of the person, for whose motion large images are reduced; None: unknown
+    in_full_size: bool = False  # the images are not reduced all the same, for they would show next to nothing
     begin: int | None = None  # the frame from which the surface is measured, if not the usual one (`surface.beginning`)
     surfaceless: bool = False  # nothing could be measured, or nothing is to be
     silhouettes: Silhouettes = field(default_factory=Silhouettes)
@@ -72,23 +74,36 @@ class Run:
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
-        if self.record["stages"].get("measure", {}).get("reduction") == 1.0 and self.measured_footage is not self.footage:
-            self._measure_in_full_size()
+        measured = self.record["stages"].get("measure", {})
+        if "reduction" in measured:  # results of earlier versions do not tell the distance, which was that of the clicks
+            self.distance_m = measured["distance_m"] if "distance_m" in measured else clicked_distance_m(self.measured_footage)
+            if measured["reduction"] == 1.0 and self.measured_footage.full_size_px:
+                self._measure_in_full_size()
+
+    @property
+    def reduced_for_m(self) -> float | None:
+        """The distance of the person for whom the images are reduced, where they are; None: they are not."""
+        return None if self.in_full_size else self.distance_m
 
     @property
     def measured_footage(self) -> Footage:
         """The footage at the size at which its surface is measured and tracked."""
-        return measured_footage(self.footage, self.settings["surface"].quality, self.settings["growing"].spacing_px)
+        return measured_footage(self.footage, MeasureSettings.of(self.settings), self.reduced_for_m)
 
     def choose_image_size(self, monitor: Monitor) -> None:
-        """Measure the images as they are, not reduced, if the reduced ones show next to nothing and none were measured before."""
-        small = self.measured_footage
-        if small is not self.footage and "measure" not in self.record["stages"]:
-            if not shows_enough(small, MeasureSettings.of(self.settings), self.results, self.begin, monitor):
+        """Reduce large images, unless reduced ones show next to nothing; images that were measured before keep their size."""
+        if "measure" in self.record["stages"]:
+            return
+        settings = MeasureSettings.of(self.settings)
+        if (person := person_seen(self.footage, settings, monitor)) is not None:
+            self.distance_m = person.distance_m
+            small = self.measured_footage
+            first = person.frame if self.begin is None else self.begin
+            if small.full_size_px and not shows_enough(small, settings, self.results, first, monitor):
                 self._measure_in_full_size()
 
     def _measure_in_full_size(self) -> None:
-        self.settings["surface"] = replace(self.settings["surface"], quality="surface")
+        self.in_full_size = True
         self.warn(IN_FULL_SIZE)
 
     @property

@@ -93,7 +93,7 @@ class Pieces:
             InputError: see `measure_piece`.
         """
         settings: dict[str, Any] = {name: from_table(kind, task["settings"][name], f"[{name}]") for name, kind in SETTINGS.items()}
-        same = [task[name] for name in ("take", "frames", "delay_images", "settings")]
+        same = [task[name] for name in ("take", "frames", "delay_images", "reduced_for_m", "settings")]
         if self._opened is None or self._opened[0] != same:
             self._opened = same, _opened(task, settings)
         keys = {int(frame): key for frame, key in task["keys"].items()}
@@ -109,7 +109,7 @@ def _opened(task: Task, settings: Mapping[str, Any]) -> Footage:
     take = read_take(Path(task["take"]))
     footage = only_frames(open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), (task["frames"][0], task["frames"][1]))
     footage = replace(footage, delay_images=tuple(task["delay_images"]))
-    return measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
+    return measured_footage(footage, MeasureSettings.of(settings), task["reduced_for_m"])
 
 
 def _task(run: Run, keys: Mapping[int, str]) -> Task:
@@ -119,6 +119,7 @@ def _task(run: Run, keys: Mapping[int, str]) -> Task:
         "out": str(run.results.folder),
         "frames": [frames.start, frames.stop],
         "delay_images": list(run.footage.delay_images),
+        "reduced_for_m": run.reduced_for_m,
         "settings": {name: to_table(value) for name, value in run.settings.items()},
         "keys": {str(frame): key for frame, key in keys.items()},
     }

@@ -8,6 +8,8 @@ they do in the images of a smaller camera, and the cost no longer depends on the
 texture of fine grain alone: where reduced images show next to nothing, they are measured as they are.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from ..body.model_file import read_model
@@ -17,28 +19,77 @@ from ..foundation.progress import Monitor
 from ..results.folder import Results
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage
+from ..take.surface_clicks import surface_clicks
 from .measure import NothingMeasured, measure_frames
-from .starts import MeasureSettings
+from .starts import MIN_SEEDS, MeasureSettings, first_frame, person_depths
 
 POINTS = 2000.0  # N
 LEAST_FACTOR = 1.5  # a reduction by less is not worth the loss
 LEAST_SHARE = 0.25  # of N, in the reduced images of a frame; with fewer points these lack the texture
+LOOKED_PX = 800.0  # width of the images in which the person is looked for; wide enough for seeds
+LOOKED_FRAMES = 3  # in which the person is looked for: the first that is measured, one in the middle of the take, the last
 
 
-def measured_footage(footage: Footage, quality: str, spacing_px: int) -> Footage:
-    """The footage as it is measured with a quality (`SurfaceSettings`): smaller where a body is to be fitted and the images are large.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PersonSeen:
+    """How far the person is from the reference camera, and a frame that shows the person."""
 
-    The clicks tell how far away the person is; without clicks, and with interlaced video, the images stay as they are.
+    distance_m: float
+    frame: int
+
+
+def measured_footage(footage: Footage, settings: MeasureSettings, distance_m: float | None) -> Footage:
+    """The footage as it is measured: with the clicks that the surface follows, and smaller where a person at this distance is to be
+    fitted and the images are large.
 
     Raises:
-        InputError: the clicks contradict each other, or the model is unknown.
+        InputError: the model is unknown.
     """
-    take = footage.take
-    if quality != "motion" or take.joints_model is None or not take.clicks.joints or take.interlaced != "none":
-        return footage
-    depth = float(np.median([clicked_depth(footage, name, at) for name, at in take.clicks.joints.items()]))
-    factor = np.sqrt(seen_area_m2(take.joints_model) / POINTS) / spacing_px * footage.rig.cameras[take.reference].focal_px / depth  # (1)
-    return footage.reduced(float(factor)) if factor >= LEAST_FACTOR else footage
+    take, growing = footage.take, settings.growing
+    clicks = surface_clicks(take, automatic_seeds=growing.seed_spacing_px > 0)
+    measured = footage if clicks is take.clicks else replace(footage, take=replace(take, clicks=clicks))
+    if distance_m is None or take.joints_model is None:
+        return measured
+    focal_px = footage.rig.cameras[take.reference].focal_px
+    factor = np.sqrt(seen_area_m2(take.joints_model) / POINTS) / growing.spacing_px * focal_px / distance_m  # (1)
+    return measured.reduced(float(factor)) if factor >= LEAST_FACTOR else measured
+
+
+def person_seen(footage: Footage, settings: MeasureSettings, monitor: Monitor) -> PersonSeen | None:
+    """Where the person is for whose motion the images may be reduced: where the clicks show it, or else the seeds of a few frames.
+
+    None: nobody is seen, or the images stay as they are: interlaced ones, and all where the quality is "surface" or no body is wanted.
+
+    Raises:
+        InputError: the images cannot be read, or clicks contradict each other.
+    """
+    take, distances = footage.take, dict[int, float]()
+    if settings.surface.quality != "motion" or take.joints_model is None or take.interlaced != "none":
+        return None
+    usual = measured_footage(footage, settings, None)
+    first = first_frame(usual)
+    if (clicked_m := clicked_distance_m(usual)) is not None:
+        return PersonSeen(distance_m=clicked_m, frame=first)
+    if not settings.growing.seed_spacing_px:
+        return None
+    factor = max(camera.size_px[0] for camera in usual.rig.cameras) / LOOKED_PX
+    small = usual.reduced(factor) if factor > 1 else usual
+    frames = dict.fromkeys((first, footage.frames[len(footage.frames) // 2], footage.frames[-1]))
+    for i, frame in enumerate(frames):
+        depth = person_depths(small, settings, frame, monitor.part("seeds", i, len(frames)))
+        if len(depth) >= MIN_SEEDS:
+            distances[frame] = float(np.median(depth))
+    return PersonSeen(distance_m=float(np.median([*distances.values()])), frame=next(iter(distances))) if distances else None
+
+
+def clicked_distance_m(footage: Footage) -> float | None:
+    """How far the clicked joints are from the reference camera; None without clicks.
+
+    Raises:
+        InputError: the clicks contradict each other.
+    """
+    depths = [clicked_depth(footage, name, at) for name, at in footage.take.clicks.joints.items()]
+    return float(np.median(depths)) if depths else None
 
 
 def shows_enough(reduced: Footage, settings: MeasureSettings, results: Results, first: int | None, monitor: Monitor) -> bool:

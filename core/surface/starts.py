@@ -292,6 +292,17 @@ def first_seeds(footage: Footage, settings: MeasureSettings, frame: int, monitor
     return _first_foreground(frame_views(footage, frame, settings, first=True), settings, monitor)
 
 
+def person_depths(footage: Footage, settings: MeasureSettings, frame: int, monitor: Monitor) -> np.ndarray:
+    """The depths (N,) [m] in the reference camera of the seeds on the person in a frame.
+
+    Raises:
+        InputError: the images cannot be read.
+    """
+    now = frame_views(footage, frame, settings, first=True)
+    where, seeds = _first_foreground(now, settings, monitor)
+    return now.views.base.to_camera(_person_points(now, settings, seeds, where))[:, 2]
+
+
 def _first_foreground(now: FrameViews, settings: MeasureSettings, monitor: Monitor) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in the first frame, inside silhouettes if there are any, and the seeds there."""
     footage, take = now.footage, now.footage.take

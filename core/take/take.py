@@ -65,6 +65,7 @@ TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY, AUTO_BODY = "none", "auto"  # `model` under [body]; the latter where nothing is said
 WHOLE_BODY = "full"  # the model that has all joints
+START_ALONE = (AUTO_BODY, WHOLE_BODY, "upper_body")  # models whose joints need no clicks; a limb starts alone where its person is visible
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 

@@ -103,8 +103,11 @@ def test_a_file_with_footage_is_left_alone(blender: ModuleType, saved: Path) -> 
 def test_the_same_is_computed_again(blender: ModuleType, saved: Path) -> None:
     blender.ops.tricap.load_sample()
     joints = saved / NAME / "results" / "joints.csv"
-    shipped = read_joints(joints).joints_m
+    shipped = read_joints(joints)
     assert blender.ops.tricap.compute_sample() == {"FINISHED"}
-    for name, places in read_joints(joints).joints_m.items():
-        assert np.linalg.norm(places - shipped[name], axis=1).max() < 0.005, "other machines round otherwise"
+    again = read_joints(joints).joints_m
+    apart = {name: np.linalg.norm(again[name] - places, axis=1) for name, places in shipped.joints_m.items()}
+    for name, far in apart.items():  # other machines round otherwise, and what the images hardly show may end elsewhere
+        assert (far < np.maximum(0.005, 3 * shipped.sigma_m[name])).all(), name
+    assert np.mean(np.concatenate([*apart.values()]) < 0.005) > 0.9
     assert (joints.parent / "report" / "report.html").is_file()

@@ -19,10 +19,10 @@ from ...motion.retarget.points import joint_of
 from ...results.folder import Results
 from ...take.footage import Footage, footage_frames
 from ...take.sources import KeypointSource
-from ...take.take import JOINTS, FrameClicks, Take
+from ...take.take import JOINTS, START_ALONE, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
-from ..settings import START_ALONE, FitSettings
+from ..settings import FitSettings
 from .clicks import check_apart, initial_clicks, read_clicks
 from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from ...body.skeleton import Skeleton, joint_positions
+from ...body.trunk import LEAST_TRUNK_JOINTS, trunk_joints
 from ..inputs.clicks import Clicks
 from ..observations import JointLimits, Observation, PosePrior, Proportions
 from ..observations.shape_priors import STATURE_SIGMA
@@ -19,8 +20,6 @@ GRID_STEP = np.radians(25.0)  # of the coarse search
 FREE_SPAN = np.pi  # search range of a DOF without limits
 STEPS = 40
 BASE_SIGMA_M = 10.0
-STIFF = np.radians(65.0)  # a joint that bends less belongs to the trunk
-LEAST_TRUNK_JOINTS = 3  # for the rotation of the trunk
 SMALL_ANGLES = 1e-3  # the weight of angles in the coarse search: of poses that fit alike, the one nearest to rest
 CORRELATION_S = 0.5  # poses closer in time are about the same
 ENOUGH_BONES = 4  # between clicks, for a stature
@@ -62,17 +61,6 @@ def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Ob
     covariance = ANYONES_SIGMA**2 + OWN_SIGMA**2 * np.eye(len(lengths))
     found = inverse_kinematics(parameters, clicks, priors, Proportions(mean=lengths, covariance=covariance))
     return float(np.exp(np.mean(found.vector[parameters.layout.group("lengths")] - lengths))), CLICKED_STATURE_SIGMA
-
-
-def trunk_joints(skeleton: Skeleton) -> list[str]:
-    """The joints of the trunk: those of the first bone and of the bones on it that hardly bend."""
-    stiff = [
-        not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= STIFF
-        for b, bone in enumerate(skeleton.bones)
-    ]
-    for b, p in enumerate(skeleton.parents):
-        stiff[b] = stiff[b] and (p < 0 or stiff[p])
-    return list(dict.fromkeys(j for bone, s in zip(skeleton.bones, stiff) if s for j in (bone.head_joint, bone.tail_joint)))
 
 
 def coarse_pose(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:

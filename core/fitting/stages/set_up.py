@@ -8,6 +8,7 @@ import numpy as np
 
 from ...body.model_file import BodyModel, read_model, smallest_model, with_limits
 from ...body.shape import BodyShape, default_shape, one_ball_shape, scaled_shape
+from ...body.trunk import LEAST_TRUNK_JOINTS, suffice_for_pose, trunk_joints
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...take.take import AUTO_BODY, WHOLE_BODY
@@ -28,7 +29,7 @@ from ..solve.time_priors import LEAST, typical_acceleration
 from ..start.find import find_start
 from ..start.search import Framing
 from ..state import ShapeParameters
-from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors, trunk_joints
+from .inverse_kinematics import clicked_stature, dof_priors
 from .long_sequence import AT_ONCE
 
 FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
@@ -145,11 +146,8 @@ def needs_start(given: FitInput, settings: FitSettings) -> bool:
         return False
     skeleton = with_limits(read_model(given.model), given.limits, given.locked).skeleton
     _, places = clicks_by_frame(given, skeleton.joint_names, settings)
-    trunk = trunk_joints(skeleton)
-    of_trunk = np.array([name in trunk for name in skeleton.joint_names])
-    most = max((int(np.isfinite(xyz).all(axis=1).sum()) for xyz in places.values()), default=0)
-    most_of_trunk = max((int((np.isfinite(xyz).all(axis=1) & of_trunk).sum()) for xyz in places.values()), default=0)
-    return most < 2 or (len(trunk) > LEAST_TRUNK_JOINTS and most_of_trunk < LEAST_TRUNK_JOINTS)
+    located = [{name for name, place in zip(skeleton.joint_names, xyz) if np.isfinite(place).all()} for xyz in places.values()]
+    return not any(suffice_for_pose(joints, skeleton) for joints in located)
 
 
 def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, without: tuple[str, ...] = ()) -> StartJoints | None:

@@ -131,7 +131,14 @@ def test_a_worker_whose_run_is_gone_ends_without_a_word(tmp_path: Path) -> None:
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     worker = subprocess.Popen(command, env=os.environ | environment, **pipes)  # type: ignore[call-overload]
     worker.stdout.close()  # nobody reads its answers
-    refused = {"take": str(tmp_path), "frames": [0, 1], "delay_images": [], "settings": dict.fromkeys(workers.SETTINGS, {}), "keys": {}}
+    refused = {
+        "take": str(tmp_path),
+        "frames": [0, 1],
+        "delay_images": [],
+        "reduced_for_m": None,
+        "settings": dict.fromkeys(workers.SETTINGS, {}),
+        "keys": {},
+    }
     said = worker.communicate((json.dumps(refused) + "\n").encode())[1]
     assert worker.returncode == 0 and said == b""
 

@@ -1,5 +1,7 @@
 """Large images are reduced to what a body's motion needs; everything that leaves the measurement is in pixels of the files' images."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,15 @@ from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.results.run_json import read_run
-from tricap.core.run import pipeline, take_run
+from tricap.core.run import pipeline, take_run, workers
+from tricap.core.run.engine import Engine
 from tricap.core.run.inspection import patch_boxes, read_points, read_removed
+from tricap.core.run.settings import settings_of
+from tricap.core.run.stages import stage_keys
 from tricap.core.run.take_run import Run, open_run
 from tricap.core.surface import resolution
-from tricap.core.surface.resolution import measured_footage, seen_area_m2
+from tricap.core.surface.resolution import measured_footage, person_seen, seen_area_m2
+from tricap.core.surface.starts import MeasureSettings
 from tricap.core.take.footage import Footage, open_take
 from tricap.core.take.take import read_take, take_of_text
 
@@ -54,8 +60,9 @@ def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resolution, "POINTS", resolution.POINTS / 10)
 
 
-def _tracked(take: Path, out: Path, overrides: Any = None) -> Run:
+def _tracked(take: Path, out: Path, overrides: Any = None, engine: Engine | None = None) -> Run:
     with open_run(take, out, overrides) as run:
+        run.engine = engine
         pipeline.track(run, Monitor())
     return run
 
@@ -64,17 +71,76 @@ def test_a_person_needs_pixels_of_some_millimetres() -> None:
     assert 0.5 < seen_area_m2("full") < 0.7 and 0.04 < seen_area_m2("arm.R") < 0.06  # adults cover about 0.6 m² of a picture
 
 
+def _measuring(quality: str = "motion", spacing_px: int = 4) -> MeasureSettings:
+    return MeasureSettings.of(settings_of({}, {"surface": {"quality": quality}, "growing": {"spacing_px": spacing_px}}, "the test"))
+
+
+def _reduced(footage: Footage, settings: MeasureSettings) -> Footage:
+    """The footage as a run would first try to measure it."""
+    person = person_seen(footage, settings, Monitor())
+    return measured_footage(footage, settings, person.distance_m if person else None)
+
+
 def test_only_large_images_of_a_body_are_reduced(large_take: Path, few_points: None) -> None:
     footage = open_take(read_take(large_take))
-    small = measured_footage(footage, "motion", 4)
+    small = _reduced(footage, _measuring())
     assert small.reduction == pytest.approx(np.full((3, 2), FACTOR), rel=0.1) and small.click_sigma_px < footage.click_sigma_px
     assert small.read(0)[1].shape[::-1] == small.rig.cameras[1].size_px
     unchanged = [
-        measured_footage(footage, "surface", 4),
-        measured_footage(footage, "motion", 16),
-        measured_footage(_other(footage), "motion", 4),
+        _reduced(footage, _measuring("surface")),
+        _reduced(footage, _measuring(spacing_px=16)),
+        _reduced(_other(footage), _measuring()),
     ]
     assert all(found.full_size_px == () for found in unchanged)
+
+
+def _with_clicks(take: Path, folder: Path, *joints: str) -> Path:
+    """A copy of a take with the clicks of these joints alone."""
+    shutil.copytree(take, folder)
+    head, clicks = (take / "take.toml").read_text().split("[seeds")[0], (take / "take.toml").read_text().split("[seeds.joints]\n")[1]
+    kept = [line for line in clicks.splitlines() if any(joint in line for joint in joints)]
+    (folder / "take.toml").write_text("\n".join([head, "[seeds]\nframe = 1\n[seeds.joints]", *kept]) if kept else head)
+    return folder
+
+
+def _of_a_person(take: Path, folder: Path) -> Path:
+    """A copy of the take whose cylinder is said to be a person, with clicks on three joints of the trunk."""
+    text = (_with_clicks(take, folder, "shoulder.R", "elbow.R", "wrist.R") / "take.toml").read_text()
+    text = text.replace('model = "arm.R"', 'model = "full"').replace("elbow.R", "hip.R").replace("wrist.R", "hip.L")
+    (folder / "take.toml").write_text(text)
+    return folder
+
+
+def test_without_clicks_seeds_show_how_far_the_person_is(large_take: Path, few_points: None, tmp_path: Path) -> None:
+    footage = open_take(read_take(_with_clicks(large_take, tmp_path / "take")))
+    person = person_seen(footage, _measuring(), Monitor())
+    assert person is not None and person.distance_m == pytest.approx(2.1, abs=0.1)
+    assert _reduced(footage, _measuring()).reduction == pytest.approx(np.full((3, 2), FACTOR), rel=0.1)
+
+
+@pytest.mark.slow
+def test_clicks_that_are_no_start_leave_the_measured_surface_alone(
+    large_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resolution, "LEAST_SHARE", 0.02)  # for it is a cylinder
+    whole = _of_a_person(large_take, tmp_path / "whole")
+    bare, lone = _with_clicks(whole, tmp_path / "bare"), _with_clicks(whole, tmp_path / "lone", "shoulder.R", "hip.R")
+    first = _tracked(bare, tmp_path / "out")
+    measured = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "cache").rglob("*.npz")}
+    (bare / "take.toml").write_text((lone / "take.toml").read_text())
+    again = _tracked(bare, tmp_path / "out")
+    assert measured == {path: path.stat().st_mtime_ns for path in measured} and first.measured_footage.full_size_px
+    assert first.keys["track"] == again.keys["track"] and first.keys["fit"] != again.keys["fit"]
+    assert again.distance_m == first.distance_m and np.array_equal(again.clouds[2].xyz_m, first.clouds[2].xyz_m)
+
+    def key(take: Path, spacing_px: int = 24) -> str:
+        settings = first.settings | {"growing": replace(first.settings["growing"], seed_spacing_px=spacing_px)}
+        return stage_keys(open_take(read_take(take)), settings, tmp_path)["measure"]
+
+    none = _with_clicks(large_take, tmp_path / "none")
+    (none / "take.toml").write_text((none / "take.toml").read_text().replace('model = "arm.R"', 'model = "full"'))
+    assert key(lone) == key(none) != key(whole)
+    assert key(lone, 0) != key(none, 0)  # without automatic seeds all clicks are needed
 
 
 def _other(footage: Footage) -> Footage:
@@ -113,13 +179,26 @@ def test_images_that_show_nothing_when_they_are_reduced_are_measured_as_they_are
 ) -> None:
     monkeypatch.setattr(resolution, "LEAST_SHARE", 10.0)
     run = _tracked(large_take, tmp_path / "out")
-    assert run.measured_footage is run.footage and take_run.IN_FULL_SIZE in run.record["warnings"]
+    assert not run.measured_footage.full_size_px and take_run.IN_FULL_SIZE in run.record["warnings"]
     assert run.record["stages"]["measure"]["reduction"] == 1
     whole = {path: path.read_bytes() for path in (tmp_path / "out" / "cache" / "surface").iterdir()}
     monkeypatch.setattr(take_run, "shows_enough", None)  # decided once
     again = _tracked(large_take, tmp_path / "out")
-    assert again.measured_footage is again.footage and take_run.IN_FULL_SIZE in again.record["warnings"]
+    assert not again.measured_footage.full_size_px and take_run.IN_FULL_SIZE in again.record["warnings"]
     assert whole == {path: path.read_bytes() for path in (tmp_path / "out" / "cache" / "surface").iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.02, 10.0], ids=["reduced", "in full size"])
+def test_workers_measure_images_of_the_same_size(large_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    monkeypatch.setattr(resolution, "LEAST_SHARE", share)
+    take = _of_a_person(large_take, tmp_path / "take")
+    one = _tracked(take, tmp_path / "one")
+    monkeypatch.setattr(workers, "FEWEST", 1)
+    two = _tracked(take, tmp_path / "two", engine=Engine(workers=2, retries=1))
+    assert bool(one.measured_footage.full_size_px) == bool(two.measured_footage.full_size_px) == (share < 1)
+    for name in sorted(path.name for path in (tmp_path / "one" / "cache" / "surface").iterdir()):
+        assert (tmp_path / "one" / "cache" / "surface" / name).read_bytes() == (tmp_path / "two" / "cache" / "surface" / name).read_bytes()
 
 
 def test_checkpoints_of_reduced_images_are_shown_in_full_pixels(large_take: Path, few_points: None, tmp_path: Path) -> None:
