@@ -21,7 +21,7 @@ LONGEST_S = 0.5  # on a machine that does nothing else
 
 def steps() -> drive.Steps:
     take, arm = drive.HERE / "arm", importlib.import_module("bl_ext.user_default.tricap.core.synthetic.arm")
-    arm.make_arm_take(take, arm.ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none"))
+    arm.make_arm_take(take, arm.ArmTakeSettings(frames=12, fps=15.0, width_px=384, interlaced="none"))
     bpy.ops.tricap.open_take(directory=str(take))
     bpy.context.scene.tricap.out = str(take / "results")
     yield from drive.sidebar("VIEW_3D", "Tricap")
