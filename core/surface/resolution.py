@@ -26,7 +26,7 @@ from .starts import MIN_SEEDS, MeasureSettings, first_frame, person_depths
 POINTS = 2000.0  # N
 LEAST_FACTOR = 1.5  # a reduction by less is not worth the loss
 LEAST_SHARE = 0.25  # of N, in the reduced images of a frame; with fewer points these lack the texture
-LOOKED_PX = 800.0  # width of the images in which the person is looked for; wide enough for seeds
+LOOKED_PX = 640.0  # width of the images in which the person is looked for; wide enough for seeds
 LOOKED_FRAMES = 3  # in which the person is looked for: the first that is measured, one in the middle of the take, the last
 
 
@@ -45,14 +45,19 @@ def measured_footage(footage: Footage, settings: MeasureSettings, distance_m: fl
     Raises:
         InputError: the model is unknown.
     """
-    take, growing = footage.take, settings.growing
-    clicks = surface_clicks(take, automatic_seeds=growing.seed_spacing_px > 0)
+    take = footage.take
+    clicks = surface_clicks(take, automatic_seeds=settings.growing.seed_spacing_px > 0)
     measured = footage if clicks is take.clicks else replace(footage, take=replace(take, clicks=clicks))
     if distance_m is None or take.joints_model is None:
         return measured
-    focal_px = footage.rig.cameras[take.reference].focal_px
-    factor = np.sqrt(seen_area_m2(take.joints_model) / POINTS) / growing.spacing_px * focal_px / distance_m  # (1)
-    return measured.reduced(float(factor)) if factor >= LEAST_FACTOR else measured
+    factor = _factor(footage, settings.growing.spacing_px, distance_m, take.joints_model)
+    return measured.reduced(factor) if factor >= LEAST_FACTOR else measured
+
+
+def _factor(footage: Footage, spacing_px: int, distance_m: float, model: str) -> float:
+    """By how much smaller images show the N points of a body at a distance.  (1)"""
+    focal_px = footage.rig.cameras[footage.take.reference].focal_px
+    return float(np.sqrt(seen_area_m2(model) / POINTS) / spacing_px * focal_px / distance_m)
 
 
 def person_seen(footage: Footage, settings: MeasureSettings, monitor: Monitor) -> PersonSeen | None:
@@ -79,6 +84,8 @@ def person_seen(footage: Footage, settings: MeasureSettings, monitor: Monitor) -
         depth = person_depths(small, settings, frame, monitor.part("seeds", i, len(frames)))
         if len(depth) >= MIN_SEEDS:
             distances[frame] = float(np.median(depth))
+            if _factor(footage, settings.growing.spacing_px, distances[frame], take.joints_model) < LEAST_FACTOR:
+                break  # the images are not large
     return PersonSeen(distance_m=float(np.median([*distances.values()])), frame=next(iter(distances))) if distances else None
 
 
