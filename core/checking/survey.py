@@ -30,6 +30,7 @@ SAME_RATE = 0.02  # relative difference of two frame rates
 TIMESTAMPS = "Give the view the `timestamps` of its images in take.toml, or convert the movie to a constant frame rate."
 REPEATED = 0.2  # of a view's usual motion energy, which includes the noise
 FEWEST_FRAMES = 4  # for a usual motion energy
+BRIEF = 3  # frames; where less moves for longer, or at an end of the take, the person stands still or is not there
 SELDOM = 0.02  # share of repeated frames, and one at least, that harms nothing: there the motion pauses for a frame
 
 
@@ -223,9 +224,19 @@ def _repeated(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
         usual = float(np.median(known)) if len(figures.frames) >= FEWEST_FRAMES and len(known) else 0.0
         with np.errstate(invalid="ignore"):
             same = (figures.energy[k] < REPEATED * usual) & shown
+            frozen = (figures.energy[k] == 0) & (np.delete(figures.energy, k, axis=0) > 0).any(axis=0)  # not even noise, and others go on
+        same &= _brief(same) | frozen
         if usual > 0 and same.any():
             findings.append(_repeats(name, figures.frames[int(np.argmax(same))], int(same.sum()), len(same)))
     return findings
+
+
+def _brief(low: np.ndarray) -> np.ndarray:
+    """Which frames (T,) lie in a row of at most BRIEF frames that are `low`, between others that are not."""
+    brief, ends = np.zeros(len(low), dtype=bool), np.flatnonzero(np.diff(low.astype(int)))  # of each row, low or not, the last frame
+    for before, last in zip(ends, ends[1:]):
+        brief[before + 1 : last + 1] = low[last] and last - before <= BRIEF
+    return brief
 
 
 def _repeats(name: str, first: int, count: int, frames: int) -> Finding:

@@ -27,7 +27,7 @@ POINTS = 2000.0  # N
 LEAST_FACTOR = 1.5  # a reduction by less is not worth the loss
 LEAST_SHARE = 0.25  # of N, in the reduced images of a frame; with fewer points these lack the texture
 LOOKED_PX = 640.0  # width of the images in which the person is looked for; wide enough for seeds
-LOOKED_FRAMES = 3  # in which the person is looked for: the first that is measured, one in the middle of the take, the last
+TALL_M = 1.75  # of a person who fills the image; where even then it is not large, nobody is looked for
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,7 +75,9 @@ def person_seen(footage: Footage, settings: MeasureSettings, monitor: Monitor) -
     first = first_frame(usual)
     if (clicked_m := clicked_distance_m(usual)) is not None:
         return PersonSeen(distance_m=clicked_m, frame=first)
-    if not settings.growing.seed_spacing_px:
+    camera = footage.rig.cameras[take.reference]
+    filled_m = camera.focal_px * TALL_M / camera.size_px[1]
+    if not settings.growing.seed_spacing_px or _factor(footage, settings.growing.spacing_px, filled_m, take.joints_model) < LEAST_FACTOR:
         return None
     factor = max(camera.size_px[0] for camera in usual.rig.cameras) / LOOKED_PX
     small = usual.reduced(factor) if factor > 1 else usual
@@ -84,9 +86,10 @@ def person_seen(footage: Footage, settings: MeasureSettings, monitor: Monitor) -
         depth = person_depths(small, settings, frame, monitor.part("seeds", i, len(frames)))
         if len(depth) >= MIN_SEEDS:
             distances[frame] = float(np.median(depth))
-            if _factor(footage, settings.growing.spacing_px, distances[frame], take.joints_model) < LEAST_FACTOR:
-                break  # the images are not large
-    return PersonSeen(distance_m=float(np.median([*distances.values()])), frame=next(iter(distances))) if distances else None
+    if not distances:
+        return None
+    middle = sorted(distances, key=lambda frame: distances[frame])[len(distances) // 2]  # in an empty frame false seeds lie anywhere
+    return PersonSeen(distance_m=distances[middle], frame=middle)
 
 
 def clicked_distance_m(footage: Footage) -> float | None:

@@ -436,6 +436,25 @@ def test_one_repeated_frame_is_a_remark_and_several_are_wrong(repeats: tuple[int
         }
 
 
+def repeats_of(*energy: np.ndarray) -> list[tuple[str, int, int]]:
+    """Frames that are said to be repeated in views of such motion energies (T,)."""
+    like = np.full((len(energy), len(energy[0])), 50.0)
+    names = tuple("LCR"[: len(energy)])
+    found = picture_findings(Survey(frames=range(12), energy=np.stack(energy), spread=like, bright=3 * like, white=0 * like), names)
+    return [(str(finding.sentence[5]), int(finding.figures["frames"]), int(finding.figures["first"])) for finding in found]
+
+
+def test_a_person_who_is_not_there_yet_or_stands_still_is_no_repeated_frame() -> None:
+    moving, frames = 1.0 + rhythm(12), np.arange(12)
+    for still in (frames < 5, frames > 8, (frames > 3) & (frames < 8)):
+        quiet = np.where(still, 0.03, moving)  # the noise alone
+        assert not repeats_of(quiet) and not repeats_of(quiet, quiet) and not repeats_of(quiet, moving)
+        frozen = np.where(still, 0.0, moving)
+        assert repeats_of(frozen, moving) == [("L", still.sum(), np.argmax(still))]
+    brief = np.where((frames > 3) & (frames < 7), 0.03, moving)
+    assert repeats_of(brief, moving) == [("L", 3, 4)] and repeats_of(brief, brief) == [("L", 3, 4), ("C", 3, 4)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("view", ["L", "C", "R"])
 def test_a_camera_that_was_moved_along_its_base_is_named(arm_recording: Record, tmp_path: Path, view: str) -> None:

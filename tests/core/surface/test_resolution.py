@@ -111,8 +111,12 @@ def _of_a_person(take: Path, folder: Path) -> Path:
     return folder
 
 
-def test_without_clicks_seeds_show_how_far_the_person_is(large_take: Path, few_points: None, tmp_path: Path) -> None:
+def test_without_clicks_seeds_show_how_far_the_person_is(
+    large_take: Path, few_points: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     footage = open_take(read_take(_with_clicks(large_take, tmp_path / "take")))
+    assert person_seen(footage, _measuring(), Monitor()) is None  # a person who fills so low an image needs every pixel,
+    monkeypatch.setattr(resolution, "TALL_M", 0.4)  # a cylinder does not
     person = person_seen(footage, _measuring(), Monitor())
     assert person is not None and person.distance_m == pytest.approx(2.1, abs=0.1)
     assert _reduced(footage, _measuring()).reduction == pytest.approx(np.full((3, 2), FACTOR), rel=0.1)
@@ -122,7 +126,8 @@ def test_without_clicks_seeds_show_how_far_the_person_is(large_take: Path, few_p
 def test_clicks_that_are_no_start_leave_the_measured_surface_alone(
     large_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resolution, "LEAST_SHARE", 0.02)  # for it is a cylinder
+    monkeypatch.setattr(resolution, "LEAST_SHARE", 0.02)  # for it is a cylinder,
+    monkeypatch.setattr(resolution, "TALL_M", 0.4)  # not a person
     whole = _of_a_person(large_take, tmp_path / "whole")
     bare, lone = _with_clicks(whole, tmp_path / "bare"), _with_clicks(whole, tmp_path / "lone", "shoulder.R", "hip.R")
     first = _tracked(bare, tmp_path / "out")
