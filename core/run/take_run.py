@@ -12,6 +12,7 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
+from ..fitting.inputs.take_inputs import check_body
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
@@ -340,6 +341,7 @@ def _checked_footage(take: Take, settings: Mapping[str, Any], out: Path, frames:
         clicked_depth(footage, name, at)
     if take.joints_model is not None:
         read_model(take.joints_model)
+        check_body(footage, settings["fitting"])
     check_separate_folder(out, take.folder, (path for s in footage.sequences for path in s.files()))
     return footage
 

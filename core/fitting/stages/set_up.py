@@ -95,7 +95,7 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
         given = of_model(given, start.model if start is not None else smallest_model(located) if located else WHOLE_BODY)
         if not needs_start(given, settings):
             return given
-    certain = start is not None and start.probability >= settings.least_start_probability
+    certain = _is_certain(start, settings)
     if start is None or (given.model not in PERSONS.values() and not certain):  # a limb is started by clicks on it, not elsewhere
         raise NobodyFound(_nobody_found(given.model, is_chosen))
     if not is_chosen and not given.clicks and start.probability < LEAST_PERSON:
@@ -153,7 +153,8 @@ def needs_start(given: FitInput, settings: FitSettings) -> bool:
 def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, without: tuple[str, ...] = ()) -> StartJoints | None:
     """The joints of the person in the easiest frame, and how sure they are; None where nobody is found.
 
-    Clicks are observations; where there are some, the start is in one of their frames. `without`: see `pose_dictionary`.
+    Clicks are observations; where there are some, the start is in one of their frames, unless it is certain in another frame only: there
+    they correct what follows. `without`: see `pose_dictionary`.
 
     Raises:
         InputError: clicks contradict each other.
@@ -172,9 +173,18 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
         if given.model == WHOLE_BODY != model:
             break  # a whole body is not begun by a part of it
         fit = replace(_without_start(of_model(given, model), settings, points_of), monitor=monitor)
-        if (start := find_start(fit, points_of, given.frames, given.time_s, monitor, shown, without)) is not None:
+        start = find_start(fit, points_of, given.frames, given.time_s, monitor, shown, without)
+        if fit.clicked and not _is_certain(start, settings):
+            anywhere = find_start(replace(fit, clicked={}, places={}), points_of, given.frames, given.time_s, monitor, shown, without)
+            if anywhere is not None and anywhere.frame not in given.clicks and _is_certain(anywhere, settings):
+                start = anywhere
+        if start is not None:
             return start
     return None
+
+
+def _is_certain(start: StartJoints | None, settings: FitSettings) -> bool:
+    return start is not None and start.probability >= settings.least_start_probability
 
 
 def _without_start(given: FitInput, settings: FitSettings, points_of: Callable[[int], CloudPoints]) -> FitContext:

@@ -20,7 +20,7 @@ Where an arm lies on the body is hardly seen in one frame: an adjustment that be
 Wrists therefore have a larger sigma (`StartJoints.sigma_m`).
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +45,7 @@ from .refine import (
     thinned_points,
     with_clicks,
     with_lengths,
+    with_limb,
     with_limbs,
 )
 from .search import Framing, framing, hypotheses
@@ -128,9 +129,11 @@ def find_start(
     searched = [chosen[0]] if fit.clicked else [of_frame[0].t for of_frame in found]
     clicked = {t: with_clicks(fit, thinned_points(points_of(t)), best.followed[0].at(t), last) for t in searched}
     limbs = {t: limb_places(fit, points_of(t), one, last) for t, one in clicked.items()}
+    for t in searched:
+        clicked[t], limbs[t] = _with_legs(fit, points_of(t), clicked[t], limbs[t], last)
     at = max(searched, key=lambda t: surely(limbs[t]))
     arms = [limb for limb in limbs[at] if next(iter(limb.doubt)) in ARMS]
-    legs = [leg for leg in map(_surest, zip(*limbs.values())) if next(iter(leg.doubt)) not in ARMS and leg.certainty < ELSEWHERE]
+    legs = [leg for leg in _legs(map(_surest, zip(*limbs.values()))) if leg.certainty < ELSEWHERE]
     joints = np.unique(fit.clicked[at].joint) if at in fit.clicked else np.zeros(0, dtype=np.intp)
     doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(joints)
     unsure = tuple(joint for arm in arms if arm.certainty < LEAST_CERTAINTY for joint in arm.doubt)
@@ -326,6 +329,27 @@ def surely(limbs: Sequence[LimbPlaces]) -> float:
     return float(np.prod([limb.certainty for limb in limbs]))
 
 
+def _with_legs(
+    fit: FitContext, points: CloudPoints, found: Explanation, limbs: list[LimbPlaces], monitor: Monitor
+) -> tuple[Explanation, list[LimbPlaces]]:
+    """An explanation with its limbs' places; better ones, if a leg is more probably elsewhere and the whole body explains more with it
+    there. Explanations that were followed to another frame may have lost a leg on the way."""
+    thin = thinned_points(points)
+    for _ in _legs(limbs):
+        leg = min(_legs(limbs), key=lambda leg: leg.certainty)
+        if leg.certainty >= ELSEWHERE:
+            break
+        better = max(with_limb(fit, thin, found, leg.poses[int(np.argmax(leg.gain))], monitor), key=lambda one: one.score)
+        if better.score <= found.score:
+            break
+        found, limbs = better, limb_places(fit, points, better, monitor)
+    return found, limbs
+
+
+def _legs(limbs: Iterable[LimbPlaces]) -> list[LimbPlaces]:
+    return [limb for limb in limbs if next(iter(limb.doubt)) not in ARMS]
+
+
 def _surest(of_frames: Sequence[LimbPlaces]) -> LimbPlaces:
     """The places of one limb in the frame in which it is most certain."""
     return max(of_frames, key=lambda limb: limb.certainty)
@@ -356,4 +380,7 @@ def _decisive(explanations: Sequence[Explanation], probability: np.ndarray, name
     for other, p in zip(explanations[1:], probability[1:].tolist()):
         total += p * np.minimum(difference_m(best, other, names), 2 * SAME_M)
     total[clicked] = 0.0
-    return names[int(np.argmax(total))] if total.any() else next(name for name in names if name.startswith("elbow"))
+    if total.any():
+        return names[int(np.argmax(total))]
+    left = [name for j, name in enumerate(names) if j not in clicked and name.partition(".")[0] in ASKED]
+    return next((name for name in left if name.startswith("elbow")), left[0] if left else names[0])

@@ -96,22 +96,29 @@ def adjusted(
 
 
 def carried(fit: FitContext, points_of: Callable[[int], CloudPoints], found: Explanation, to: int, monitor: Monitor) -> Explanation:
-    """The explanation in frame index `to`: the pose is adjusted there, and on the way in some of the frames between."""
+    """The explanation in frame index `to`: the pose is adjusted there, and on the way in some of the frames between; limbs that were lost
+    on the way are looked for."""
     one, stride = found, STRIDE if to > found.t else -STRIDE
     for t in (*range(found.t + stride, to, stride), to):
         points = thinned_points(points_of(t))
         if len(points.xyz_m) >= LEAST_POINTS:
             one = adjusted(fit, points, explanation(fit, t, points, one.pose, one.vector), ROUNDS if t == to else FOLLOWING, monitor)
-    return one
+    return with_limbs(fit, thinned_points(points_of(to)), one, monitor) if one.t == to else one
 
 
 def with_limbs(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:
     """The same, or better with limbs that were looked for all around where they explain what no other part does."""
     best = found
     for pose in reacquired_poses(fit, found.t, points, found.pose, found.vector, monitor):
-        other = adjusted(fit, points, explanation(fit, found.t, points, pose, found.vector), ROUNDS[-1:], monitor)
-        best = max(best, other, key=lambda one: one.score)
+        best = max(best, *with_limb(fit, points, found, pose, monitor), key=lambda one: one.score)
     return best
+
+
+def with_limb(fit: FitContext, points: CloudPoints, found: Explanation, pose: np.ndarray, monitor: Monitor) -> list[Explanation]:
+    """An explanation with the pose (D,) in which a limb was found elsewhere, as it is and adjusted: near other limbs an adjustment may draw
+    it to their points."""
+    there = explanation(fit, found.t, points, pose, found.vector)
+    return [there, adjusted(fit, points, there, ROUNDS[-1:], monitor)]
 
 
 def exchanged(
@@ -145,11 +152,13 @@ def exchanged(
 
 
 def with_lengths(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> tuple[Explanation, float]:
-    """Pose and bone lengths adjusted together, and the stature over the template's, by bones that are no limb's."""
+    """Pose and bone lengths adjusted together, unless that explains less, and the stature over the template's, by bones that are no
+    limb's."""
     near = adjusted(fit, points, found, ((1.5, LENGTH_STEPS),), monitor, "lengths")
     lengths = fit.parameters.layout.group("lengths")
     of_trunk = [not {bone.head_joint, bone.tail_joint} <= set(fit.found) for bone in fit.model.skeleton.bones]
-    return near, float(np.exp(np.mean((near.vector[lengths] - fit.parameters.vector()[lengths])[of_trunk])))
+    stature = float(np.exp(np.mean((near.vector[lengths] - fit.parameters.vector()[lengths])[of_trunk])))
+    return max(found, near, key=lambda one: one.score), stature
 
 
 def with_clicks(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:

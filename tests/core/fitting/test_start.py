@@ -16,7 +16,7 @@ from tricap.core.fitting.inputs.start_joints import StartJoints
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages import set_up
 from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_start, with_start
-from tricap.core.fitting.start import find, search, taken_back
+from tricap.core.fitting.start import find, refine, search, taken_back
 from tricap.core.fitting.start.find import Followed, _decisive, _difference, _least_sure, _with_limbs, is_confirmed, judged, surely
 from tricap.core.fitting.start.limb_places import LimbPlaces, limb_places
 from tricap.core.fitting.start.pose_dictionary import known_poses
@@ -88,12 +88,31 @@ def test_a_person_is_found_from_points_alone(quick) -> None:
 
 def _limbs(given: FitInput, pose: np.ndarray, monkeypatch) -> dict[str, LimbPlaces]:
     """Where the limbs of a pose may be in a frame, by the first of their joints."""
-    used = {}
-    monkeypatch.setattr(set_up, "find_start", lambda fit, points_of, *_: used.update(fit=fit, points=points_of(0)))
+    used = []
+    monkeypatch.setattr(set_up, "find_start", lambda fit, points_of, *_: used.append((fit, points_of(0))))
     find_joints(given, SETTINGS, Monitor())
-    fit, points = used["fit"], used["points"]
+    fit, points = used[0]
     found = explanation(fit, 0, points, pose, fit.parameters.vector())
     return {next(iter(limb.doubt)): limb for limb in limb_places(fit, points, found, Monitor())}
+
+
+def test_a_leg_that_was_lost_on_the_way_to_another_frame_is_found_again(monkeypatch) -> None:
+    """An adjustment draws it to the other leg's points; where it was found, all of the body explains more."""
+    used, pose = {}, _pose(0.0)
+    monkeypatch.setattr(set_up, "find_start", lambda fit, points_of, *_: used.update(fit=fit, points=points_of(0)))
+    find_joints(_input(pose, points=6000), SETTINGS, Monitor())
+    fit, points = used["fit"], used["points"]
+    astray = pose.copy()
+    astray[SKELETON.layout["hip.R abduction"]] = np.radians(-25.0)
+    monkeypatch.setattr(refine, "adjusted", lambda fit, points, start, *_: explanation(fit, 0, points, astray, start.vector))
+    found = explanation(fit, 0, refine.thinned_points(points), astray, fit.parameters.vector())
+    limbs = limb_places(fit, points, found, Monitor())
+    assert min(limb.certainty for limb in find._legs(limbs)) < find.ELSEWHERE
+    better, again = find._with_legs(fit, points, found, limbs, Monitor())
+    assert better.score > found.score and min(limb.certainty for limb in find._legs(again)) > find.ELSEWHERE
+    ankle, true = NAMES.index("ankle.R"), _joints(pose)
+    assert np.linalg.norm(better.joints_m[ankle] - true[ankle]) < 0.1 < np.linalg.norm(found.joints_m[ankle] - true[ankle])
+    assert find._with_legs(fit, points, better, again, Monitor())[0] is better
 
 
 def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicked(monkeypatch) -> None:
@@ -240,6 +259,25 @@ def test_a_start_is_needed_without_three_joints_of_the_trunk() -> None:
     assert not needs_start(clicked("hip.R", "hip.L", "neck", "wrist.R"), SETTINGS)
     arm = replace(clicked("shoulder.R", "elbow.R"), model="arm.R")
     assert not needs_start(arm, SETTINGS)
+
+
+def test_clicks_where_the_start_is_not_certain_correct_a_start_elsewhere(monkeypatch) -> None:
+    """A click on an arm that is guessed must not make a start uncertain that was certain without it."""
+    at = dict(zip(NAMES, _joints(_pose(0.0))))
+    clicks = {1: {"elbow.L": {c.name: c.project(at["elbow.L"]) for c in front_rig(WIDE_PX).cameras}}}
+    given = _input(_pose(0.0))
+    given = replace(given, clouds=given.clouds * 3, time_s=np.arange(3) / 25.0, frames=range(3), clicks=clicks)
+    joints = dict(xyz_m=at, stature=1.0, model="full", unsure=(), rivals={}, ask="ankle.R")
+
+    for (sure, p), frame in {(2, 0.99): 2, (2, 0.9): 1, (1, 0.99): 1}.items():
+        free = StartJoints(frame=sure, probability=p, **joints)
+        bound = StartJoints(frame=1, probability=0.9, **joints)
+        monkeypatch.setattr(set_up, "find_start", lambda fit, *_, free=free, bound=bound: bound if fit.clicked else free)
+        start = find_joints(given, SETTINGS, Monitor())
+        assert start is not None and start.frame == frame
+    one = [_explained(_joints(_pose(0.0)), 0.0)]
+    assert _decisive(one, np.ones(1), ("pelvis", "elbow.L", "elbow.R", "knee.L"), np.array([2])) == "elbow.L"
+    assert _decisive(one, np.ones(1), ("pelvis", "elbow.L", "knee.L"), np.array([1])) == "knee.L"
 
 
 def test_an_uncertain_start_is_not_used(monkeypatch) -> None:
