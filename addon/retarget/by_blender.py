@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
@@ -30,6 +31,7 @@ from ...core.motion.retarget.rig import Motion
 from ...core.results.folder import check_inside
 from ...core.results.outputs import check_replaceable
 from ..scene import skin
+from ..scene.standing import has_feet
 from . import playing, programs
 from .build import build_armature
 from .own_textures import own_textures
@@ -53,13 +55,17 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     if kind == "abc" and not out.is_dir():
         raise InputError(NO_MESHES)
     made = skin.skin_of_run(out) if out.is_dir() else None
-    motion = programs.rooted(with_digits(motion, made[0]) if made else motion, program)
+    lift_m = 0.0
+    if made:
+        shape, of_run = made
+        lift_m = -float(of_run.vertices_m[:, 2].min()) if of_run is not None and has_feet(shape) else 0.0
+        motion = raised(with_digits(motion, shape), lift_m)
+    motion = programs.rooted(motion, program)
     with _plain_armature(kind, file, program, motion) as armature_object:
         if made:
-            shape, of_run = made
             picture = out / "skin" / TEXTURE if of_run is not None else None
             skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run, texture=picture)
-            skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))
+            skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4) @ Matrix.Translation((0.0, 0.0, lift_m)))
         _write(kind, file, program, armature_object, bone_names(motion.rig, program))
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
 
@@ -91,6 +97,13 @@ def _plain_armature(kind: str, file: Path, program: Program, motion: Motion) -> 
 
 def _unit_m(kind: str, program: Program) -> float:
     return metres_per(program.unit or "m", "the preset") if kind == "fbx" else 1.0
+
+
+def raised(motion: Motion, by_m: float) -> Motion:
+    """The same motion of a rig whose rest pose is higher: a whole body rests on the floor, as other programs expect."""
+    rig, up = motion.rig, np.array([0.0, 0.0, by_m])
+    soles = {bone: points + up for bone, points in rig.sole_m.items()}
+    return replace(motion, rig=replace(rig, head_m=rig.head_m + up, tail_m=rig.tail_m + up, sole_m=soles))
 
 
 def scaled(motion: Motion, factor: float) -> Motion:

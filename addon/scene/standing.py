@@ -69,7 +69,7 @@ def standing(
     `skin_m` (V, 3): the skin in the rest pose, which has the soles; `values` (T, D): the motion; `floor_m`: the floor where it is known.
     """
     bones = {bone.name: b for b, bone in enumerate(shape.skeleton.bones)}
-    if skin_m is None or not set(FEET) <= set(bones) or base_height(shape) is None:
+    if skin_m is None or not has_feet(shape):
         return None
     _, head_m = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dof_names)))
     lowest = float(skin_m[:, 2].min())
@@ -78,6 +78,11 @@ def standing(
 
     found = floor_m if floor_m is not None else floor_height(shape, values, frames, fps, ankle - lowest)
     return Standing(lift_m=-lowest, floor_m=0.0 if found is None else found)
+
+
+def has_feet(shape: BodyShape) -> bool:
+    """Whether a body can stand: it has feet, and its base is upright."""
+    return set(FEET) <= {bone.name for bone in shape.skeleton.bones} and base_height(shape) is not None
 
 
 def base_height(shape: BodyShape) -> tuple[str, int, float] | None:

@@ -24,7 +24,7 @@ from ..motion.tables import JointTable, MotionTable, read_joints, read_motion
 from ..results import blend_file
 from ..results.folder import lost
 from ..results.own_files import files_of
-from ..results.run_json import UNTIL, read_run
+from ..results.run_json import ASKS, UNTIL, read_run
 from .findings import Cause, Checked, Finding, doubtful, wrong
 
 MOST_FRAMES = 10_000_000  # that a run.json may name
@@ -86,7 +86,9 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
         )
     if "measure" not in run["stages"]:
         return [*findings, wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
-    if (last := run.get(UNTIL, "measure")) not in run["stages"]:
+    if ASKS in run and "fit" not in run["stages"]:
+        findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended with a question.", run[ASKS]))
+    elif (last := run.get(UNTIL, "measure")) not in run["stages"]:
         findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended before its stage “{last}” was done.", again))
     incomplete = lost(folder, run)
     for stage, files in NEEDED.items():

@@ -9,9 +9,10 @@ from ..foundation.errors import InputError
 
 FORMAT, VERSION = "tricap-run", 1
 UNTIL = "until"  # the last stage that a command was to do
+ASKS = "asks"  # what the user is asked before the run can go on
 FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
-    "reference_note": str, "files": dict, "blend": list, "outlines": dict, "films": dict, UNTIL: str,
+    "reference_note": str, "files": dict, "blend": list, "outlines": dict, "films": dict, UNTIL: str, ASKS: str,
 }  # fmt: skip
 STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),

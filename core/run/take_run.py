@@ -12,7 +12,9 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
+from ..fitting.inputs.start_joints import NeedsClick
 from ..fitting.inputs.take_inputs import check_body
+from ..fitting.stages.set_up import NobodyFound
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
@@ -21,6 +23,7 @@ from ..report.silhouettes import Silhouettes
 from ..results import blend_file, edited_tables, films
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..results.own_files import files_of
+from ..results.run_json import ASKS
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
 from ..surface.resolution import clicked_distance_m, measured_footage, person_seen, shows_enough
@@ -156,12 +159,17 @@ class Run:
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
-        """A cancelled stage says what its checkpoints keep (`stopped`), and leaves no `partial` results."""
+        """A cancelled stage says what its checkpoints keep (`stopped`), and leaves no `partial` results; what the user is asked is noted in
+        run.json."""
         try:
             yield
         except Cancelled as stop:
             self.results.remove(*partial)
             raise Cancelled(stopped()) from stop
+        except (NeedsClick, NobodyFound) as question:
+            self.record[ASKS] = str(question)
+            self.results.write_run(self.record)
+            raise
 
     def do_without_surface(self, why: str) -> None:
         """Note that there are no clouds and no trajectories."""

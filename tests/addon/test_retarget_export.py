@@ -121,6 +121,11 @@ def test_fingers_and_toes_go_with_the_measured_skin(empty: ModuleType, tmp_path:
     export_file(tmp_path / "sample" / "results", kind, file, "plain", Monitor())
     read_back(empty, file)
     (skin,) = [thing for thing in empty.data.objects if thing.type == "MESH" and len(thing.data.polygons) > 5_000]
+    for rig in (thing for thing in empty.data.objects if thing.type == "ARMATURE"):  # at rest the person stands on the floor
+        heights = {bone.name.replace("_", "."): (rig.matrix_world @ bone.matrix_local).translation.z for bone in rig.data.bones}
+        assert 0.6 < heights["pelvis"] < 1.2 and 0.0 < heights["foot.L"] < 0.2, heights
+        soles = min((skin.matrix_world @ vertex.co).z for vertex in skin.data.vertices)
+        assert abs(soles) < 0.01, soles
     empty.context.scene.frame_set(round(empty.context.scene.frame_end))
     played = skin.evaluated_get(empty.context.evaluated_depsgraph_get()).to_mesh()
     places, edges = np.empty(3 * len(played.vertices)), np.empty(2 * len(played.edges), dtype=np.int32)

@@ -15,6 +15,7 @@ from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
 from tricap.core.checking.take_check import check_clouds, check_first_frame
 from tricap.core.cli import main
+from tricap.core.fitting.stages.set_up import NobodyFound
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
@@ -260,6 +261,11 @@ def test_a_run_that_came_to_no_end_is_named(plane_take: Path, tmp_path: Path, mo
     assert unfinished() == [f"The run in {out} ended before its stage “report” was done."]
     assert main.main(["track", str(plane_take), "--out", str(out), "--frames", "0:2", "--quiet", "--set", "growing.spacing_px=16"]) == 0
     assert unfinished() == []
+    with open_run(plane_take, out, given, (0, 2)) as job, pytest.raises(NobodyFound), job.resumable(stopped=str):
+        job.record["stages"].pop("fit")  # the take wants no body
+        raise NobodyFound("Click the left wrist.")
+    asked = [f for f in check_run(out, Monitor()).findings if f.cause == "not finished"]
+    assert [(f.sentence, f.advice) for f in asked] == [(f"The run in {out} ended with a question.", "Click the left wrist.")]
     pipeline.run(plane_take, out, given, frames=(0, 2))
     assert unfinished() == []
     (out / ".tricap-lock").write_text('{"pid": 1}')
