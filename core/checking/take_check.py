@@ -50,12 +50,16 @@ LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joint
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself. Clicks that the body does not have.
+    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself. Clicks that the body does not have,
+    and those in one view.
 
     Raises:
         InputError: there is no such body model.
     """
     foreign = [remark(Cause.CLICKS, sentence) for sentence in clicks_of_no_joint(take)]
+    if flat := [f"{name} (frame {key.frame})" for key in take.keyframes for name, at in key.joints.items() if len(at) == 1]:
+        sentence = f"Clicked in one view only: {', '.join(flat)}. That does not show how far away the joint is."
+        foreign.append(remark(Cause.FEW_CLICKS, sentence, "Click it in a second view, too."))
     if take.joints_model is None or take.keypoints:
         return foreign
     joints = read_model(take.joints_model).skeleton.joint_names

@@ -17,7 +17,7 @@ import pytest
 
 from tricap.core.checking.findings import Cause, Checked
 from tricap.core.checking.survey import Survey, picture_findings, rate_findings
-from tricap.core.checking.take_check import check_clouds, check_take, sudden_step, timing_finding
+from tricap.core.checking.take_check import check_clouds, check_take, joint_findings, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.cli import main
 from tricap.core.foundation.errors import InputError
@@ -27,7 +27,7 @@ from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.run import pipeline, take_run
 from tricap.core.take.footage import open_take
-from tricap.core.take.take import read_take
+from tricap.core.take.take import FrameClicks, Take, read_take
 
 from ..images.test_sequence import with_a_pause
 
@@ -472,6 +472,15 @@ def test_a_black_image_does_not_make_the_others_repeats() -> None:
     energy, spread = np.array([[np.nan, 1.0, 60.0, 60.0]]), np.array([[50.0, 50.0, 0.0, 50.0]])
     found = picture_findings(Survey(frames=range(4), energy=energy, spread=spread, bright=3 * spread, white=0 * spread), ("C",))
     assert not [finding for finding in found if finding.cause == Cause.REPEATED_FRAMES]
+
+
+def test_a_keyframe_clicked_in_one_view_is_told() -> None:
+    views = {name: np.zeros(2) for name in "LC"}
+    keys = (FrameClicks(frame=3, joints={"elbow.L": {"L": np.zeros(2)}, "wrist.L": views}), FrameClicks(frame=9, joints={"neck": views}))
+    told = joint_findings(
+        cast(Take, SimpleNamespace(clicks=FrameClicks(), keyframes=keys, body_model="full", joints_model="full", keypoints=()))
+    )
+    assert [finding.harmless for finding in told] == [True] and "in one view only: elbow.L (frame 3)." in told[0].sentence
 
 
 def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
