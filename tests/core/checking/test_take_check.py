@@ -477,10 +477,9 @@ def test_a_black_image_does_not_make_the_others_repeats() -> None:
 def test_a_keyframe_clicked_in_one_view_is_told() -> None:
     views = {name: np.zeros(2) for name in "LC"}
     keys = (FrameClicks(frame=3, joints={"elbow.L": {"L": np.zeros(2)}, "wrist.L": views}), FrameClicks(frame=9, joints={"neck": views}))
-    told = joint_findings(
-        cast(Take, SimpleNamespace(clicks=FrameClicks(), keyframes=keys, body_model="full", joints_model="full", keypoints=()))
-    )
-    assert [finding.harmless for finding in told] == [True] and "in one view only: elbow.L (frame 3)." in told[0].sentence
+    take = SimpleNamespace(clicks=FrameClicks(), keyframes=keys, body_model="full", joints_model="full", keypoints=())
+    told = joint_findings(cast(Take, take))[0]
+    assert told.harmless and "in one view only: elbow.L (frame 3)." in told.sentence
 
 
 def test_a_remark_is_no_finding_of_a_check(arm_recording: Record, tmp_path: Path) -> None:
