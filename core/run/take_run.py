@@ -30,6 +30,7 @@ from ..surface.resolution import clicked_distance_m, measured_footage, person_se
 from ..surface.starts import MeasureSettings
 from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
+from ..take.sources import is_number
 from ..take.take import Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import Trajectories
@@ -79,10 +80,13 @@ class Run:
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
         measured = self.record["stages"].get("measure", {})
-        if "reduction" in measured:  # results of earlier versions do not tell the distance, which was that of the clicks
-            self.distance_m = measured["distance_m"] if "distance_m" in measured else clicked_distance_m(self.measured_footage)
-            if measured["reduction"] == 1.0 and self.measured_footage.full_size_px:
+        if is_number(told := measured.get("distance_m")) and told > 0:
+            self.distance_m = float(told)
+        if measured.get("reduction", 1.0) == 1.0:
+            if self.measured_footage.full_size_px:
                 self._measure_in_full_size()
+        elif self.distance_m is None:  # results of earlier versions do not tell it; it was that of the clicks
+            self.distance_m = clicked_distance_m(self.measured_footage)
 
     @property
     def reduced_for_m(self) -> float | None:
