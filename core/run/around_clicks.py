@@ -39,14 +39,13 @@ from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import last_cloud
 from ..take.footage import Footage, open_take
-from ..take.surface_clicks import surface_clicks
 from ..take.take import AUTO_BODY, FrameClicks, Take, read_take
 from ..tracking.corrections import corrected_cloud
 from ..tracking.trajectories import read_trajectories
 from .file_digests import FileDigests
 from .record import FrameTable, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
-from .stages import CONTENT, Stamp, stage_keys
+from .stages import CONTENT, Stamp, followed_clicks, stage_keys
 
 FITTED_WITH = "fitted_with"  # entry of the fit in run.json: what the body was fitted with, see `fitted_with`
 MOST_CLOUDS = 64  # in memory: those of the background, and of one stretch
@@ -83,7 +82,7 @@ def fitted_with(footage: Footage, settings: Mapping[str, Any], out: Path) -> dic
 
 def besides_clicks(footage: Footage, settings: Mapping[str, Any], out: Path, stamp: Stamp | None = None) -> str:
     """The key of everything that a body depends on besides clicks; `stamp`: what stands for a file, by default its time."""
-    followed = surface_clicks(footage.take, automatic_seeds=settings["growing"].seed_spacing_px > 0)
+    followed = followed_clicks(footage.take, settings)
     take = replace(footage.take, clicks=replace(followed, joints={}), keyframes=())
     return stage_keys(replace(footage, take=take), settings, out, stamp)["fit"]
 

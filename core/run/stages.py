@@ -39,16 +39,14 @@ class StageInput:
     """The inputs and files of a stage that no earlier stage has."""
 
     settings: tuple[str, ...]  # groups of knobs
-    take: Callable[
-        [Footage, Mapping[str, Any], Stamp], Any
-    ]  # by settings, the parts of take.toml, rig.toml and the footage, as values with a `repr`
+    take: Callable[[Footage, Mapping[str, Any], Stamp], Any]  # the parts of take, rig and footage as values with a `repr`
     files: tuple[str, ...]  # results in OUT, which a run removes once they are stale
 
 
 def _measure_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) -> Any:
     """The images, the cameras, the person's masks, and the clicks that the surface follows."""
     take = footage.take
-    clicks = _followed(take, settings)
+    clicks = followed_clicks(take, settings)
     regions = [c for c in _corrections(take) if c[0] == "region"]
     views = [(v.name, v.offset_frames, *v.clock, *_timestamps(take, v, stamp)) for v in take.views]
     files = [[stamp(path) for path in s.files()] for s in footage.sequences]
@@ -60,7 +58,8 @@ def _measure_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) 
     return views, files, rig, rows, take.reference_view, footage.frames, _clicked(clicks), regions, person, starts.ALGORITHM, *swept
 
 
-def _followed(take: Take, settings: Mapping[str, Any]) -> FrameClicks:
+def followed_clicks(take: Take, settings: Mapping[str, Any]) -> FrameClicks:
+    """The clicks that the surface follows, with the settings of a run; see `surface_clicks`."""
     return surface_clicks(take, automatic_seeds=settings["growing"].seed_spacing_px > 0)
 
 
@@ -82,7 +81,7 @@ def _fit_input(footage: Footage, settings: Mapping[str, Any], stamp: Stamp) -> A
     model = take.body_model or NO_BODY
     own = store.digest(*model_files(model)) if model.endswith(".toml") else ""
     named = Path(model).name if own else model
-    others = [] if _followed(take, settings) is take.clicks else [_clicked(take.clicks)]  # the key of the surface lacks them
+    others = [] if followed_clicks(take, settings) is take.clicks else [_clicked(take.clicks)]  # the key of the surface lacks them
     return (
         named,
         own,
