@@ -83,7 +83,7 @@ class Run:
         if is_number(told := measured.get("distance_m")) and told > 0:
             self.distance_m = float(told)
         if measured.get("reduction", 1.0) == 1.0:
-            if self.measured_footage.full_size_px:
+            if self.distance_m is not None and self.measured_footage.full_size_px:
                 self._measure_in_full_size()
         elif self.distance_m is None:  # results of earlier versions do not tell it; it was that of the clicks
             self.distance_m = clicked_distance_m(self.measured_footage)
