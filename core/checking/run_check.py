@@ -84,7 +84,7 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
         findings.append(
             wrong(Cause.NOT_FINISHED, f"A run in {folder} was killed before its end, or is still at work ({lock.NAME}).", again)
         )
-    if "measure" not in run["stages"]:
+    if not {"measure", "fit"} & set(run["stages"]):
         return [*findings, wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
     if ASKS in run and "fit" not in run["stages"]:
         findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended with a question.", run[ASKS]))

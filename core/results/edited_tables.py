@@ -1,7 +1,7 @@
 """What people edit of a fit's results besides body.blend: the fit replaces it only as long as it is byte for byte what the fit wrote.
 
-run.json has the digests in the entry of the fit. A file that differs from its own gets another name, and a sentence says so; without a
-digest (earlier versions wrote none, and a killed fit has none yet) it is replaced.
+run.json has the digests in the entry of the fit. A file that differs from its own is copied to another name, and a sentence says so;
+without a digest (earlier versions wrote none, and a killed fit has none yet) it is replaced.
 """
 
 from collections.abc import Mapping
@@ -29,19 +29,20 @@ def edited(folder: Path, stages: Mapping[str, Any]) -> list[str]:
 
 
 def keep(folder: Path, stages: Mapping[str, Any]) -> list[str]:
-    """Give edited files another name; a sentence for each.
+    """Copy edited files to other names; a sentence for each.
 
     Raises:
-        InputError: one cannot be renamed.
+        InputError: one cannot be copied.
     """
     sentences = []
     for name in edited(folder, stages):
         path = folder / name
         try:
-            kept = store.rename_to_free(path, edited_names(path))
+            store.write_bytes(part := path.with_name(f".{path.name}.part"), path.read_bytes())
+            kept = store.rename_to_free(part, edited_names(path))
         except OSError as error:
             reason = error.strerror or error
-            raise InputError(f"Cannot rename {path}: {reason}. Close the program that uses it, or choose another folder.") from error
+            raise InputError(f"Cannot copy {path}: {reason}. Free some space, or choose another folder.") from error
         sentences.append(f"{path} was changed since the fit wrote it, and is kept as “{kept.name}”.")
     return sentences
 

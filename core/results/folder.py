@@ -37,7 +37,8 @@ MADE_BY = {  # what of them the stages write, and others need
 MOST_ROW = 1 << 16  # bytes of a row of a table
 
 FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
-PARENTS = ("cache", FIELDS)  # whose folders are written to
+EARLIER = "earlier_body"  # the finished body that was replaced last: see earlier_body.py
+PARENTS = ("cache", FIELDS, EARLIER)  # whose folders are written to
 WRITTEN = (
     *PARENTS,
     "contours",

@@ -20,7 +20,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
 from ..report.pages import check_pictured
 from ..report.silhouettes import Silhouettes
-from ..results import blend_file, edited_tables, films
+from ..results import blend_file, earlier_body, edited_tables, films
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
 from ..results.own_files import files_of
 from ..results.run_json import ASKS
@@ -154,11 +154,13 @@ class Run:
         dropped = after if self.keeps_body else (*after, "report")
         self.record["stages"] = {name: entry for name, entry in self.record["stages"].items() if name not in dropped}
         names = [name for stage in after for name in STAGE_INPUTS[stage].files]
-        self.notes += [OTHER_IMAGES, *_remove(self.results, [*names, *FIT_STEPS, FITTED])]
+        kept = [] if self.keeps_body else earlier_body.keep(self.results.folder, _recorded(self.results), self.keys.get("fit", ""))
+        self.notes += [OTHER_IMAGES, *kept, *_remove(self.results, [*names, *FIT_STEPS, FITTED])]
 
     def remove_body(self, names: Sequence[str]) -> None:
-        """Remove the body's files; what was edited gets another name."""
+        """Remove the body's files: a finished body becomes the earlier one, and what was edited is copied to another name."""
         self.notes += edited_tables.keep(self.results.folder, self.record["stages"])
+        self.notes += earlier_body.keep(self.results.folder, _recorded(self.results), self.keys.get("fit", ""))
         self.results.remove(*names)
 
     @contextmanager
@@ -211,11 +213,11 @@ def open_run(
 ) -> Iterator[Run]:
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
-    What an earlier run of other input left in OUT is removed (with `for_contours` surface and tracks alone: the files of a fit stay until
-    the next one); `restart` removes it all. A body.blend that somebody edited, and an outline that was drawn on other images, get another
-    name; `notes` has the sentences that say so, and so has an error that follows. `needs_body`: a body of the same input must be there, but
-    for its outlines. `spares`: results of another take, or a body of frames that are left out now, are not removed. `pictures`: the frames
-    of the report's, by default a few. `clicked`: gives the take with other clicks than its own.
+    What an earlier run of other input left in OUT is removed (with `for_contours` surface and tracks alone: the files of a fit stay
+    until the next one); `restart` removes it all. A finished body moves to earlier_body; a body.blend that somebody edited, and an outline
+    that was drawn on other images, get another name. `notes` has the sentences that say so, and so has an error that follows. `needs_body`:
+    a body of the same input must be there, but for its outlines. `spares`: results of another take, or a body of frames that are left out
+    now, are not removed. `pictures`: the frames of the report's, by default a few. `clicked`: gives the take with other clicks.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -246,6 +248,7 @@ def open_run(
             record["stages"] = {stage: entry for stage, entry in kept.items() if stage not in incomplete}
             if "fit" not in record["stages"]:
                 notes += edited_tables.keep(results.folder, _recorded(results).get("stages", {}))
+                notes += earlier_body.keep(results.folder, _recorded(results), keys["fit"])
             notes += _remove_all(results) if restart else _remove_stale(results, before, kept)
             if record["stages"].keys() != before.get("stages", {}).keys():  # a run that is stopped leaves no word of what is made again
                 results.write_run(record)

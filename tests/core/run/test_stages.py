@@ -310,15 +310,17 @@ def test_what_was_edited_of_a_fit_is_kept_when_it_is_made_again(plane_take: Path
     for name in edited_tables.EDITABLE:
         store.write_bytes(out / name, b"as the fit wrote it")
     record = json.loads((out / "run.json").read_text())
-    record["stages"]["fit"][edited_tables.ENTRY] = edited_tables.digests(out)
+    assert record["stages"]["fit"].pop("not_done")  # as with a body, which a plane has not
+    record["stages"]["fit"] |= {edited_tables.ENTRY: edited_tables.digests(out), "joint_sigma_mm": 5.0}
     (out / "run.json").write_text(json.dumps(record))
     for name in ("motion.csv", "skin/texture.png"):
         (out / name).write_bytes(b"edited")
     with take_run.open_run(plane_take, out, {"growing": {"spacing_px": 16}, "skin": {"relief": False}}, (0, 2), restart=restart) as job:
         assert (out / "motion (edited).csv").read_bytes() == (out / "skin" / "texture (edited).png").read_bytes() == b"edited"
         assert not any((out / name).exists() for name in edited_tables.EDITABLE)
-        assert len(job.notes) == 2 and "is kept as “motion (edited).csv”" in job.notes[0]
+        assert len(job.notes) == 3 and "is kept as “motion (edited).csv”" in job.notes[0] and "fitted before is kept in" in job.notes[2]
     assert len([*out.rglob("*(edited*")]) == 2  # the others were not edited
+    assert (out / "earlier_body" / "motion.csv").read_bytes() == b"edited"
 
 
 def test_a_run_without_a_body_is_replaced_without_a_question(plane_take: Path, tmp_path: Path) -> None:
