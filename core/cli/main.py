@@ -39,7 +39,7 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     _prepare_libraries()
     monitor = Monitor()
     if not args.quiet:
-        monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress()
+        monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress(monitor)
     try:
         check_outputs(args)
         with _interrupts(monitor), threadpool_limits(1, user_api="blas"), warnings.catch_warnings():  # BLAS that Blender has loaded
@@ -105,11 +105,18 @@ def _progress_line(monitor: Monitor) -> Callable[[str, float, float], None]:
     return report
 
 
-def _plain_progress() -> Callable[[str, float, float], None]:
-    """A line per tenth of a stage."""
+def _plain_progress(monitor: Monitor) -> Callable[[str, float, float], None]:
+    """A line per twentieth of a run with the time left, or else per tenth of what is computed."""
     last: dict[str, int] = {}
 
     def report(stage: str, done: float, total: float) -> None:
+        if (course := monitor.course) is not None:
+            twentieth, left = int(20 * course.fraction), course.seconds_left
+            if last.setdefault("", -1) < twentieth:
+                last[""] = twentieth
+                more = "" if left is None or twentieth == 20 else f", {time_text(left)} left"
+                streams.write_line(f"{5 * twentieth} %{more} ({stage})", sys.stderr)
+            return
         tenth = int(10 * done / total) if total else 10
         if last.get(stage) != tenth:
             last[stage] = tenth

@@ -17,7 +17,7 @@ import pytest
 from tricap.core.calibration.rig_files import write_as
 from tricap.core.cli import main, stages
 from tricap.core.foundation.errors import InputError
-from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.foundation.progress import Cancelled, Course, Monitor
 from tricap.core.geometry.rig import read_rig
 from tricap.core.run import pipeline
 from tricap.core.take import writing
@@ -247,10 +247,22 @@ def test_quiet_keeps_no_finding_back(take: Path, capfd: Capture) -> None:
 
 
 def test_progress_on_stderr_is_a_line_per_tenth(capfd: Capture) -> None:
-    report = main._plain_progress()
+    report = main._plain_progress(Monitor())
     for i in range(101):
         report("surface", i, 100)
     assert capfd.readouterr().err.splitlines() == [f"surface: {10 * i} %" for i in range(11)]
+
+
+def test_progress_of_a_run_on_stderr_is_a_line_per_twentieth_with_the_time_left(capfd: Capture) -> None:
+    now = iter(range(10_000))
+    monitor = Monitor()
+    monitor.report, monitor.course = main._plain_progress(monitor), Course([("surface", 60.0), ("skin", 40.0)], clock=lambda: next(now))
+    for stage, steps in (("surface", 60), ("skin", 40)):
+        for i in range(steps + 1):
+            monitor.step(stage, i, steps)
+    lines = capfd.readouterr().err.splitlines()
+    assert [line.split(" %")[0] for line in lines] == [str(5 * i) for i in range(21)]
+    assert lines[0] == "0 % (surface)" and lines[12].endswith(" s left (surface)") and lines[13].endswith(" s left (skin)"), lines
 
 
 def test_ctrl_c_stops_within_a_second_and_says_what_is_kept(take: Path, tmp_path: Path, capfd: Capture) -> None:
