@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..body.limb_words import FEW_FRAMES, counts, frame_list, guessed_frames, limb_words
-from ..body.motion import FITTED, PARTIAL, SEEN, BodyFit
+from ..body.limb_words import FEW_FRAMES, counts, frame_list, guessed_frames, limb_words, to_click
+from ..body.motion import FITTED, GUESSED, INFERRED, PARTIAL, SEEN, BodyFit, BodyMotion
 from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
@@ -139,12 +139,12 @@ def fit_warnings(body: BodyFit) -> list[str]:
         if len(frames) > FEW_FRAMES:
             warnings.append(
                 f"The place of the {limb} is guessed in {len(frames)} frames ({frame_list(frames)}), for the images do not show where it "
-                "is: look at it there, and click its joints in one of these frames."
+                f"is: look at it there, and {_click(motion, limb, GUESSED)}, if a view shows it."
             )
         elif seen < LEAST_SEEN * len(row) and len(row) - seen > FEW_FRAMES:
             warnings.append(
-                f"The {limb} is seen well in {seen} of {len(row)} frames only, and inferred in the others: look at it, and click its "
-                "joints where it is wrong."
+                f"The {limb} is seen well in {seen} of {len(row)} frames only, and inferred in the others: look at it, and where it is "
+                f"wrong {_click(motion, limb, INFERRED)}."
             )
     for bone, frames in body.contradicted.items():
         if len(frames) > FEW_FRAMES:
@@ -155,6 +155,12 @@ def fit_warnings(body: BodyFit) -> list[str]:
     if not body.converged:
         warnings.append(f"The fit has not converged after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
     return warnings
+
+
+def _click(motion: BodyMotion, limb: str, word: str) -> str:
+    """What to click: "click wrist.L, best in frame 12"."""
+    joints, frame = to_click(motion.joint_names, motion.known, motion.frames.tolist(), limb, word)
+    return f"click {' and '.join(joints)}, best in frame {frame}"
 
 
 def limb_name(bone: str) -> str:
