@@ -36,6 +36,7 @@ RAYS_PX = 1.0  # distance between the rays of matched points
 NEAR_M = 0.03  # beyond the largest ball of a bone: points so near belong to it
 FEWEST_ON_LIMB = 30  # points
 MOST_LISTED = 8  # frames
+AGAIN = "Run the same command again; it resumes there."
 NEEDED = {"measure": ("clouds",), "track": ("trajectories.npz",), "fit": ("body.toml", "joints.csv", "motion.csv"), "report": ("report",)}
 
 
@@ -77,31 +78,36 @@ def _warnings(run: Mapping[str, Any]) -> list[Finding]:
     return [doubtful(Cause.WARNING, str(w)) for w in run["warnings"]]
 
 
+def not_measured(folder: Path) -> Finding:
+    """That a run was stopped early, maybe before it had a run.json."""
+    return wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", AGAIN)
+
+
 def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
     """Stages that were never finished, and missing files of finished ones."""
-    findings, again = [], "Run the same command again; it resumes there."
+    findings: list[Finding] = []
     if (folder / lock.NAME).is_file():
         findings.append(
-            wrong(Cause.NOT_FINISHED, f"A run in {folder} was killed before its end, or is still at work ({lock.NAME}).", again)
+            wrong(Cause.NOT_FINISHED, f"A run in {folder} was killed before its end, or is still at work ({lock.NAME}).", AGAIN)
         )
     if not {"measure", "fit"} & set(run["stages"]):
-        return [*findings, wrong(Cause.NOT_FINISHED, f"The run in {folder} was stopped before its surface was measured.", again)]
+        return [*findings, not_measured(folder)]
     if ASKS in run and "fit" not in run["stages"]:
         findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended with a question.", run[ASKS]))
     elif (last := run.get(UNTIL, "measure")) not in run["stages"]:
-        findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended before its stage “{last}” was done.", again))
+        findings.append(wrong(Cause.NOT_FINISHED, f"The run in {folder} ended before its stage “{last}” was done.", AGAIN))
     incomplete = lost(folder, run)
     for stage, files in NEEDED.items():
         done = "not_done" not in run["stages"].get(stage, {"not_done": True})
         gone = [name for name in files if done and not (folder / name).exists()]
         less = [name for name in incomplete.get(stage, []) if name not in gone]
         if gone:
-            findings.append(wrong(Cause.FILES_MISSING, f"{', '.join(gone)} of the stage “{stage}” is missing in {folder}.", again))
+            findings.append(wrong(Cause.FILES_MISSING, f"{', '.join(gone)} of the stage “{stage}” is missing in {folder}.", AGAIN))
         if less:
             sentence = f"{', '.join(less)} of the stage “{stage}” in {folder} is missing, cut, damaged, or lacks files."
-            findings.append(wrong(Cause.FILES_MISSING, sentence, again))
+            findings.append(wrong(Cause.FILES_MISSING, sentence, AGAIN))
     if fault := blend_file.lacking(folder, run):
-        findings.append(wrong(Cause.FILES_MISSING, f"{blend_file.BLEND} in {folder} {fault}.", again))
+        findings.append(wrong(Cause.FILES_MISSING, f"{blend_file.BLEND} in {folder} {fault}.", AGAIN))
     return findings
 
 

@@ -45,6 +45,12 @@ def check(subject: Path, monitor: Monitor) -> Checked:
         from ..checking.rig_check import check_rig
 
         return check_rig(subject)
+    from ..results.folder import has_checkpoints
+
+    if has_checkpoints(subject / "cache"):
+        from ..checking.run_check import not_measured
+
+        return Checked(subject=str(subject), kind="result", findings=(not_measured(subject),), figures={})
     raise InputError(
         f"{subject} is neither a take (a folder with take.toml), nor a result (with run.json), nor a rig.toml; check the path."
     )

@@ -305,13 +305,13 @@ def _not_from_a_run(folder: Path) -> list[str]:
 
     A run that was stopped early leaves a checkpoint, and a killed one its lock.
     """
-    if bounded.is_of_a_run(folder) or _has_checkpoints(folder / "cache"):
+    if bounded.is_of_a_run(folder) or has_checkpoints(folder / "cache"):
         return []
     found = [name for name in ("cache", "run.json", *RESULTS) if (folder / name).exists()]
     return [name for name in found if name != "cache" or any(not p.is_dir() for p in (folder / name).rglob("*"))]
 
 
-def _has_checkpoints(cache: Path) -> bool:
+def has_checkpoints(cache: Path) -> bool:
     """Whether a folder has our checkpoints, and nothing else."""
     if not cache.is_dir() or not all(p.is_dir() for p in cache.iterdir()):
         return False

@@ -285,6 +285,7 @@ def test_ctrl_c_stops_within_a_second_and_says_what_is_kept(take: Path, tmp_path
     assert sorted(p.name for p in (out / "clouds").iterdir()) == [f"{i:04d}.ply" for i in range(kept)]
     assert len(list((out / "cache" / "surface").iterdir())) == kept and not list(out.rglob("*.part"))
     assert not (out / "trajectories.npz").exists() and printed.out == ""
+    assert main.main(["check", str(out)]) == 1 and "was stopped before its surface was measured" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("stage", ["seeds", "surface", "tracks"])
