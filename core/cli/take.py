@@ -8,7 +8,7 @@ from ..calibration.rig_files import read_any
 from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..images.sequence import movie_rate
+from ..images.sequence import movie_rate, open_sequence
 from ..take.bar_file import read_bar, write_bar
 from ..take.take import START_ALONE
 from ..take.writing import ASSUMED_FPS, footage_entry, make_take, new_table, take_of_table
@@ -42,6 +42,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError(
             f"{args.rig} has no camera “{unknown[0]}”, but {', '.join(cameras)}; give --views these names, such as {cameras[0]}=FILE."
         )
+    for (name, _), (_, source) in zip(views, links) if rig else ():
+        _check_size(name, source, rig[name].size_px)
     make_take(folder, table, links, rig)
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)
@@ -51,3 +53,16 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.fps is None and not stated:
         lines.append(f"The footage states no frame rate, so {fps:g} is assumed; if it is another, correct `fps` in {folder / 'take.toml'}.")
     return lines
+
+
+def _check_size(name: str, source: Path, size_px: tuple[int, int]) -> None:
+    """Check that the footage of a view is as large as the images of its camera.
+
+    Raises:
+        InputError: it is not, or its first image cannot be read.
+    """
+    if source.is_dir():
+        sequence = open_sequence(source, images="*", movie=None, view=name, gaps=True, size_px=size_px)
+    else:
+        sequence = open_sequence(source.parent, images=None, movie=source.name, view=name, size_px=size_px)
+    sequence.read(0)

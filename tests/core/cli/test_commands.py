@@ -375,6 +375,17 @@ def test_new_names_the_cameras_that_the_views_should_have(take: Path, tmp_path: 
     assert "has no camera “left”, but L, C, R; give --views these names, such as L=FILE." in said and not (tmp_path / "new").exists()
 
 
+def test_new_refuses_a_rig_for_images_of_another_size(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    """Before the first file is written, not when it is measured."""
+    views, rig = [f"{name}={take / name}" for name in "LCR"], tmp_path / "other.toml"
+    h, w = cv2.imread(str(take / "L" / "0000.png")).shape[:2]
+    rig.write_text((take / "rig.toml").read_text().replace(f"size = [{w}, {h}]", f"size = [{2 * w}, {2 * h}]"))
+    assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--rig", str(rig)]) == 2
+    assert f"has {w}×{h} pixels, but its camera has {2 * w}×{2 * h}; use the footage as it was calibrated." in capfd.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--rig", str(take / "rig.toml")]) == 0
+
+
 def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capture) -> None:
     views = [f"{name}={take / name}" for name in "LCR"]
     assert main.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
