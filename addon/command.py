@@ -129,6 +129,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         if args.film is not None:
             film(args.film, monitor, start_deg=args.start_deg, turn_deg=args.turn_deg, elevation_deg=args.elevation_deg)
     written = [str(path) for path in (args.preview, args.turntable, args.film) if path is not None]
+    args.always_shown = list(report.warnings)
     return [*report.warnings, *([f"{args.blend}: {report}"] if args.blend is not None else []), *written]
 
 

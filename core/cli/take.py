@@ -42,8 +42,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError(
             f"{args.rig} has no camera “{unknown[0]}”, but {', '.join(cameras)}; give --views these names, such as {cameras[0]}=FILE."
         )
-    for (name, _), (_, source) in zip(views, links) if rig else ():
-        _check_size(name, source, rig[name].size_px)
+    if rig:
+        for (name, _), (_, source) in zip(views, links):
+            _check_size(name, source, rig[name].size_px)
     make_take(folder, table, links, rig)
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)

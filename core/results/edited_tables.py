@@ -4,7 +4,9 @@ run.json has the digests in the entry of the fit. A file that differs from its o
 without a digest (earlier versions wrote none, and a killed fit has none yet) it is replaced.
 """
 
+import os
 from collections.abc import Mapping
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +40,21 @@ def keep(folder: Path, stages: Mapping[str, Any]) -> list[str]:
     for name in edited(folder, stages):
         path = folder / name
         try:
-            store.write_bytes(part := path.with_name(f".{path.name}.part"), path.read_bytes())
-            kept = store.rename_to_free(part, edited_names(path))
+            kept = _copied_before(path)
+            if kept is None:
+                store.write_bytes(part := path.with_name(f".{path.name}.part"), path.read_bytes())
+                kept = store.rename_to_free(part, edited_names(path))
         except OSError as error:
             reason = error.strerror or error
             raise InputError(f"Cannot copy {path}: {reason}. Free some space, or choose another folder.") from error
         sentences.append(f"{path} was changed since the fit wrote it, and is kept as “{kept.name}”.")
     return sentences
+
+
+def _copied_before(path: Path) -> Path | None:
+    """The copy of a file as it is, if a run that was killed has made one."""
+    copies = takewhile(os.path.lexists, edited_names(path))
+    return next((copy for copy in copies if copy.is_file() and _digest(copy) == _digest(path)), None)
 
 
 def _digest(path: Path) -> str:

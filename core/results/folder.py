@@ -132,7 +132,7 @@ class Results:
             InputError: another run is using it.
         """
         with locked(self.folder):
-            folders = [self.path(name) for name in ("clouds", "tracked", "skin", "report", "contours", "outlines")]
+            folders = [self.path(name) for name in ("clouds", "tracked", "skin", "report", "contours", "outlines", EARLIER)]
             for folder in (self.folder, *folders, *self.path("cache").glob("*/")):
                 for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
                     self.remove(str(path.relative_to(self.folder)))

@@ -281,6 +281,14 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
     assert wrong.returncode == 2 and "Traceback" not in wrong.stderr and "no run.json" in wrong.stderr
 
 
+def test_quiet_keeps_back_nothing_that_a_scene_lacks(small_run: SmallRun, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A killed run leaves no body, and its scene was written without a word."""
+    out = Path(shutil.copytree(small_run.out, tmp_path / "copied"))
+    (out / "body.toml").unlink()
+    assert main(["scene", str(out), "--blend", str(tmp_path / "a.blend"), "--quiet"]) == 0
+    assert "No armature and metaballs in the scene: body.toml is not in" in capfd.readouterr().out
+
+
 @pytest.mark.parametrize(("more", "said"), [
     (["--frame", "99", "--preview", "a.png"], "--frame 99 is not among the frames 2 to 7"),
     (["--simplify", "-1"], "--simplify -1 is out of range"),

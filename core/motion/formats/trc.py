@@ -10,6 +10,7 @@ from ...images.interlace import frame_time_s
 from ..plausible import check_places, check_times
 from .markers import Markers, axes_of, check_size, metres_per
 
+RATE_TOLERANCE = 0.02  # of the rate: 30 for 29.97 is no contradiction
 HEADINGS = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
 
 
@@ -40,7 +41,7 @@ def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
     """Read points, in the file's unit unless `unit` says otherwise.
 
     Raises:
-        InputError: it cannot be read, is no TRC file, or is shorter than its header says.
+        InputError: it cannot be read, is no TRC file, is cut, or contradicts its header.
     """
     rotation = axes_of(axes)
     lines = _lines(path)
@@ -56,9 +57,12 @@ def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
     if len(names) != n or len(set(names)) < n:
         raise InputError(f"{path} promises {n} markers and names {len(set(names))} different ones; export it again.")
     rows = [line.split("\t") for line in lines[5:] if line.strip()]
-    if len(rows) < t:
+    if len(rows) != t:
         raise InputError(f"{path} promises {t} frames and holds {len(rows)}; export it again.")
-    fps, table = _rate(header["DataRate"], path), np.array([_row(row, n, path) for row in rows[:t]])
+    if t > 1 and len(rows[-1]) < min(2 + 3 * n, *map(len, rows[:-1])):
+        raise InputError(f"{path} ends within its last row, of frame “{rows[-1][0][:20]}”; export it again.")
+    fps, table = _rate(header["DataRate"], path), np.array([_row(row, n, path) for row in rows])
+    _check_rate(rows, fps, path)
     check_times(table[:, 0], fps, f"{path} is a file")
     check_places(table[:, 1:], f"{path} is a file")
     xyz = table[:, 1:].reshape(t, n, 3) * metres_per(unit or header["Units"], path) @ rotation
@@ -83,6 +87,17 @@ def _rate(text: str, path: Path) -> float:
         return float(text)
     except ValueError as error:
         raise InputError(f"{path} has the data rate “{text[:20]}”, which is no number; export it again.") from error
+
+
+def _check_rate(rows: list[list[str]], fps: float, path: Path) -> None:
+    """Check that the times are those of the data rate, where both are there."""
+    try:
+        seconds = np.diff([float(row[1]) for row in rows])
+    except (ValueError, IndexError):
+        return
+    step = float(np.median(seconds)) if len(seconds) else np.nan
+    if step > 0 and fps > 0 and abs(step * fps - 1) > RATE_TOLERANCE:
+        raise InputError(f"{path} has {fps:g} frames per second in its header, and times of {1 / step:.4g}; correct one of them.")
 
 
 def _row(row: list[str], n: int, path: Path) -> list[float]:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.results import earlier_body
+from tricap.core.results import earlier_body, edited_tables
 from tricap.core.results.folder import EARLIER, Results
 from tricap.core.results.run_json import STAGE_FIGURES
 
@@ -60,6 +60,64 @@ def test_a_killed_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (
         earlier_body.keep(tmp_path, run, "new") and (tmp_path / EARLIER / "joints.csv").exists() and not (tmp_path / "body.toml").exists()
     )
+
+
+def test_what_somebody_put_or_edited_there_gets_another_name(tmp_path: Path) -> None:
+    """It stopped the move half-way, or was replaced without a word."""
+    place = tmp_path / EARLIER
+    earlier_body.keep(tmp_path, fitted(tmp_path, "first"), "new")
+
+    def edited() -> None:
+        (place / "motion.csv").write_text("edited")
+
+    def folder() -> None:
+        (place / "motion.csv").unlink()
+        (place / "motion.csv").mkdir()
+
+    def file() -> None:
+        place.write_text("a file")
+
+    def own() -> None:
+        (place / "thesis.txt").write_text("own")
+
+    def inside() -> None:
+        (place / "skin" / "thesis.txt").write_text("own")
+
+    def link() -> None:
+        place.symlink_to(tmp_path)
+
+    def linked_folder() -> None:
+        place.mkdir()
+        (place / "skin").symlink_to(tmp_path / "skin")
+
+    for n, change in enumerate((edited, folder, own, inside, file, link, linked_folder), 1):
+        if change in (file, link, linked_folder):
+            place.rename(tmp_path / f"away {n}")
+        change()
+        said = earlier_body.keep(tmp_path, fitted(tmp_path, f"body {n}"), "new")
+        other = tmp_path / (EARLIER + (" (edited)" if n == 1 else f" (edited {n})"))
+        assert said[0] == f"{place} has files that no run moved there, or edits, and is kept as “{other.name}”.", change
+        assert os.path.lexists(other) and (place / "motion.csv").read_text() == (place / "skin" / "0000.ply").read_text() == f"body {n}"
+    assert (tmp_path / "earlier_body (edited)" / "motion.csv").read_text() == "edited"
+    assert len(earlier_body.keep(tmp_path, fitted(tmp_path, "last"), "new")) == 1
+
+
+def test_going_back_to_the_body_that_was_being_moved_leaves_no_part_of_it(tmp_path: Path) -> None:
+    run = fitted(tmp_path, "whole")
+    earlier_body.keep(tmp_path, run, "new")
+    (tmp_path / EARLIER / "body.toml").rename(tmp_path / "body.toml")  # as a killed run leaves it
+    assert earlier_body.keep(tmp_path, run, "k") == [] and not (tmp_path / EARLIER).exists()
+
+
+def test_an_edited_table_is_copied_once(tmp_path: Path) -> None:
+    """Also where a run is killed after the copy."""
+    stages = {"fit": {edited_tables.ENTRY: {"motion.csv": "another digest"}}}
+    (tmp_path / "motion.csv").write_text("edited")
+    for _ in range(2):
+        assert "kept as “motion (edited).csv”" in edited_tables.keep(tmp_path, stages)[0]
+    (tmp_path / "motion.csv").write_text("edited again")
+    assert "kept as “motion (edited 2).csv”" in edited_tables.keep(tmp_path, stages)[0]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["motion (edited 2).csv", "motion (edited).csv", "motion.csv"]
 
 
 def test_what_is_no_whole_body_or_will_be_the_same_is_not_kept(tmp_path: Path) -> None:
