@@ -17,7 +17,7 @@ import pytest
 
 from tricap.core.checking.findings import Cause, Checked
 from tricap.core.checking.survey import Survey, picture_findings, rate_findings
-from tricap.core.checking.take_check import check_clouds, check_take, joint_findings, sudden_step, timing_finding
+from tricap.core.checking.take_check import check_clouds, check_take, joint_findings, sudden_gaps, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.cli import main
 from tricap.core.foundation.errors import InputError
@@ -411,6 +411,20 @@ def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp
         for here, there in zip(shots[4:], shots[5:]):
             shutil.copyfile(there, here)
     assert not said["sound"] and len(said["lost"]) == 1 and said["lost"][0].startswith("From frame 4 on, the rays"), said
+
+
+def test_a_frame_with_much_fewer_points_than_its_neighbours_is_named() -> None:
+    """A JPEG with a damaged part is filled with grey by the decoder, and half of the person was missing without a word."""
+    frames, points = list(range(10, 20)), np.linspace(2000.0, 1400.0, 10)
+    assert not sudden_gaps(frames, points)
+    (said,) = sudden_gaps(frames, np.where(np.arange(10) == 4, 0.5 * points, points))
+    assert said.startswith("Frame 14 has 867 measured points, and the frames beside it up to 1667: look at its images")
+    (said,) = sudden_gaps(frames, np.where(np.isin(np.arange(10), (4, 5, 8)), 0.5 * points, points))
+    assert "Frame 14" in said and "(and 2 more frames likewise)" in said
+    assert not sudden_gaps(frames, np.where(np.arange(10) < 3, 0.0, points)), "the person enters later"
+    assert not sudden_gaps(frames, 0.02 * np.where(np.arange(10) == 4, 0.5 * points, points)), "few points vary by chance"
+    assert not sudden_gaps([0], np.array([2000.0]))
+
 
 
 def test_steps_that_are_none() -> None:
