@@ -15,6 +15,7 @@ from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig, controls_of
 from ...core.motion.retarget.transfer import lowest_m, stood_up
+from ..scene.build import set_rate
 from . import saved_maps
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
@@ -152,8 +153,7 @@ def check_played(armature_object: bpy.types.Object, result: Retargeted) -> list[
 
 def set_range(scene: bpy.types.Scene, motion: Motion) -> None:
     """Give the scene the motion's frames and frame rate."""
-    whole = max(1, int(np.ceil(motion.fps - 1e-3)))
-    scene.render.fps, scene.render.fps_base = whole, whole / motion.fps
+    set_rate(scene, motion.fps)
     scene.frame_start, scene.frame_end = int(np.floor(motion.frames[0])), int(np.ceil(motion.frames[-1]))
 
 

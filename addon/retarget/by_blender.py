@@ -34,6 +34,7 @@ from ..scene import skin
 from ..scene.standing import has_feet
 from . import playing, programs
 from .build import build_armature
+from .files import rate_of_gltf
 from .own_textures import own_textures
 from .programs import Program, bone_names
 
@@ -197,6 +198,11 @@ def _fbx(path: str, program: Program) -> None:
 
 
 def _glb(path: str, program: Program) -> None:
+    with rate_of_gltf(bpy.context.scene):
+        _write_glb(path)
+
+
+def _write_glb(path: str) -> None:
     bpy.ops.export_scene.gltf(
         filepath=path,
         export_format="GLB",

@@ -16,7 +16,7 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.bvh import read_bvh
 from ...core.motion.formats.fbx import check_fbx
-from ...core.motion.formats.gltf import check_gltf
+from ...core.motion.formats.gltf import check_gltf, sampled_fps
 from ...core.motion.retarget.mapping import MappedMotion, find_map
 from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
@@ -24,6 +24,7 @@ from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
 from ...core.results.folder import check_complete
 from ..scene.armature import ROLES_KEY, SNAPS_KEY
+from ..scene.build import set_rate
 from .build import build_armature
 from .programs import is_imported_by_blender
 from .read import action_frames, read_motion, read_rig, with_residual_motion
@@ -51,7 +52,25 @@ def open_rig(path: Path) -> None:
             raise InputError(f"{path} names {devices[0]}, which is a device, a pipe or a socket, not a file; remove it from the file.")
         return
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    import_rig(path)
+    if kind not in (".glb", ".gltf", ".vrm"):
+        import_rig(path)
+        return
+    if (fps := sampled_fps(path)) is not None:  # at another rate, keys would lie between frames
+        set_rate(bpy.context.scene, fps)
+    with rate_of_gltf(bpy.context.scene):
+        import_rig(path)
+
+
+@contextmanager
+def rate_of_gltf(scene: bpy.types.Scene) -> Iterator[None]:
+    """The rate by which Blender's importer and exporter of glTF compute times: they multiply by the base by which a rate is divided."""
+    render = scene.render
+    base = render.fps_base
+    render.fps_base = 1 / base
+    try:
+        yield
+    finally:
+        render.fps_base = base
 
 
 @contextmanager

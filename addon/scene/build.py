@@ -187,10 +187,15 @@ def _keep_corrections(rig: bpy.types.Object) -> str:
     return f"; its action “{corrections.name}” is kept"
 
 
+def set_rate(scene: bpy.types.Scene, fps: float) -> None:
+    """Give the scene a frame rate, which need not be a whole number."""
+    whole = max(1, math.ceil(fps - 1e-3))
+    scene.render.fps, scene.render.fps_base = whole, whole / fps
+
+
 def set_time(scene: bpy.types.Scene, contents: Contents) -> None:
     """Give the scene the take's frames and frame rate."""
-    whole = max(1, math.ceil(contents.fps - 1e-6))
-    scene.render.fps, scene.render.fps_base = whole, whole / contents.fps
+    set_rate(scene, contents.fps)
     scene.frame_start, scene.frame_end = contents.frames
 
 

@@ -68,15 +68,10 @@ def frame_list(frames: Sequence[int], most: int | None = None) -> str:
     return ", ".join(words) + (" …" if most is not None and len(spans) > most else "")
 
 
-def to_click(joints: Sequence[str], known: Sequence[Sequence[str]], frames: Sequence[int], limb: str, word: str) -> tuple[list[str], int]:
-    """Which clicks would tell most where a limb with this word in some frames is: its joints that have it in most frames, and the middle
-    one of the longest stretch of such frames; `known` (T, J)."""
-    has = {joints[j]: [row[j] == word for row in known] for j in limb_joints(joints)[limb]}
-    most = max(sum(row) for row in has.values())
-    named = [joint for joint, row in has.items() if sum(row) == most]
-    spans = [span for span in runs(frames, [word if there else "" for there in has[named[0]]]) if span[2] == word]
-    first, last, _ = max(spans, key=lambda span: span[1] - span[0])
-    return named, (first + last) // 2
+def to_click(joints: Sequence[str], known: Sequence[Sequence[str]], limb: str, word: str) -> list[str]:
+    """Which joints of a limb have this word in most frames, so that clicks there tell most; `known` (T, J)."""
+    has = {joints[j]: sum(row[j] == word for row in known) for j in limb_joints(joints)[limb]}
+    return [joint for joint, count in has.items() if count == max(has.values())]
 
 
 def guessed_frames(frames: Sequence[int], row: Sequence[str]) -> tuple[int, ...]:

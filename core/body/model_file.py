@@ -40,6 +40,7 @@ class BodyModel:
     stations: np.ndarray  # (B, 3) fractions of the bone where its balls are
     aside: np.ndarray  # (B, 3, 2) their offsets from the bone in its x and z, as fractions of its length
     length_sigma: np.ndarray  # (B,) relative sigma of a bone's length that clicks on its joints leave
+    radius_sigma: np.ndarray  # (B,) relative sigma of the radii about a bone; 0: that of the settings
     joint_places_m: Mapping[str, np.ndarray]  # (3,) where a joint usually lies from where surfaces alone put it, in its bone's axes
 
     def __post_init__(self) -> None:
@@ -49,6 +50,7 @@ class BodyModel:
         object.__setattr__(self, "stations", frozen(self.stations, (b, 3), name="stations"))
         object.__setattr__(self, "aside", frozen(self.aside, (b, 3, 2), name="aside"))
         object.__setattr__(self, "length_sigma", frozen(self.length_sigma, (b,), name="length_sigma"))
+        object.__setattr__(self, "radius_sigma", frozen(self.radius_sigma, (b,), name="radius_sigma"))
         for joint in set(self.joint_places_m) - set(self.skeleton.joint_names):
             raise ValueError(f"there is no joint “{joint}” to place.{nearest_name(joint, self.skeleton.joint_names)}")
         places = {joint: frozen(place, (3,), name=f"place of {joint}") for joint, place in self.joint_places_m.items()}
@@ -157,6 +159,7 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
         stations=model.stations[rows],
         aside=model.aside[rows],
         length_sigma=model.length_sigma[rows],
+        radius_sigma=model.radius_sigma[rows],
         joint_places_m={joint: place for joint, place in model.joint_places_m.items() if joint in skeleton.joint_names},
     )
 
@@ -196,6 +199,7 @@ def mirrored(model: BodyModel, name: str) -> BodyModel:
         stations=model.stations,
         aside=model.aside * MIRROR[[0, 2]],
         length_sigma=model.length_sigma,
+        radius_sigma=model.radius_sigma,
         joint_places_m={other_side(joint): place * MIRROR for joint, place in model.joint_places_m.items()},
     )
 
@@ -264,16 +268,18 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
         radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in rows]
         surface, stations = [t.get("surface", (0.0, 1.0)) for t in rows], [t.get("stations", STATIONS) for t in rows]
         aside = [np.array(t.get("aside", np.zeros((3, 2))), dtype=float) for t in rows]
-        open_lengths = [float(t.get("length_sigma", 0.0)) for t in rows]
+        open_lengths, open_radii = ([float(t.get(name, 0.0)) for t in rows] for name in ("length_sigma", "radius_sigma"))
         places = {str(joint): np.array(place, dtype=float) for joint, place in table.get("joint_places_m", {}).items()}
         if table.get("symmetric", False):
             right = [i for i, bone in enumerate(bones) if bone.name.endswith(".R")]
             bones += [_mirrored_bone(bones[i]) for i in right]
             aside += [aside[i] * MIRROR[[0, 2]] for i in right]
             places |= {other_side(joint): place * MIRROR for joint, place in places.items() if joint.endswith(".R")}
-            columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths)
-            radii, surface, stations, open_lengths = ([*column, *(column[i] for i in right)] for column in columns)
+            columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths, open_radii)
+            radii, surface, stations, open_lengths, open_radii = ([*column, *(column[i] for i in right)] for column in columns)
         _check_numbers(bones, radii, surface, stations, aside, open_lengths)
+        if wrong := next((bone.name for bone, sigma in zip(bones, open_radii) if not 0 <= sigma <= 1), None):
+            raise ValueError(f"radius_sigma of “{wrong}” is no share of its radii")
         if table["base"] != bones[0].head_joint:
             raise ValueError(f"its base is {shown(table['base'])}, and its first bone begins at “{bones[0].head_joint}”")
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
@@ -285,6 +291,7 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             stations=np.array(stations),
             aside=np.array(aside),
             length_sigma=np.array(open_lengths),
+            radius_sigma=np.array(open_radii),
             joint_places_m=places,
         )
     except InputError as error:

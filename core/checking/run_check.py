@@ -48,7 +48,8 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
     try:
         run = read_run(folder / "run.json")
         _refuse_parts(run, folder)
-        findings += [*_warnings(run), *_complete(run, folder), *_same_inputs(run, folder), *_rays(run)]
+        inputs = _same_inputs(run, folder) if "measure" in run["stages"] else []  # an earlier body is of earlier ones
+        findings += [*_warnings(run), *_complete(run, folder), *inputs, *_rays(run)]
         if any(files_of(folder / "clouds", "clouds")):
             findings += _clouds(run, folder, figures, monitor)
         if (folder / "motion.csv").exists():

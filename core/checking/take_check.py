@@ -271,8 +271,8 @@ def sudden_gaps(frames: list[int], points: np.ndarray) -> list[str]:
         return []
     t, more = few[0], f" (and {len(few) - 1} more frames likewise)" if len(few) > 1 else ""
     return [
-        f"Frame {frames[t]} has {points[t]:.0f} measured points, and the frames beside it up to {beside[t - 1]:.0f}{more}: look at its images "
-        "in all views; one may be damaged, or of another moment."
+        f"Frame {frames[t]} has {points[t]:.0f} measured points, and the frames beside it up to {beside[t - 1]:.0f}{more}: look at its "
+        "images in all views; one may be damaged, or of another moment."
     ]
 
 

@@ -53,7 +53,8 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
     parser = _Parser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_new, _stages, _joints, _synchronise, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
+    own = _new, _stages, _joints, _synchronise, _check, _calibrate, _track2d, _contour, _compare, _batch, _settings, _fields
+    for add in (*own, *adders):
         add(commands)
     for sub in commands.choices.values():
         for argument in sub._actions:
@@ -260,6 +261,11 @@ def _batch(commands: Any) -> None:
     parser.add_argument("--restart", action="store_true", help="start every take again instead of resuming")
     _set_argument(parser)
     parser.add_argument("--json", action="store_true", help="print the outcomes as JSON, and nothing else on standard output")
+
+
+def _settings(commands: Any) -> None:
+    parser = _command(commands, "settings", "list all settings for --set and take.toml, with defaults and limits", action("settings"))
+    parser.add_argument("group", nargs="?", metavar="GROUP", help="those of a group alone, such as fitting")
 
 
 def _fields(commands: Any) -> None:

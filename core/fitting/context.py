@@ -225,7 +225,8 @@ class FitContext:
         """The priors of the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where there is more than the proportions
         (else infinite). `weight`: how often they will count; that of bends counts once."""
         mean, s = self.parameters.vector(), self.settings
-        sigma = np.full(len(mean), s.radius_sigma)
+        sigma, own = np.full(len(mean), s.radius_sigma), self.model.radius_sigma[self.parameters.template.metaballs.bone_index]
+        sigma[self.parameters.layout.group("radii")] = np.repeat(np.where(own > 0, own, s.radius_sigma), 2)
         sigma[self.parameters.layout.group("weights")] = WEIGHT_SIGMA
         sigma[self.parameters.layout.group("bends")] = BEND_SIGMA * np.sqrt(weight)
         of_lengths = self.parameters.layout.group("lengths")

@@ -4,7 +4,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-SKIPPED = 0.02  # of the expected time: progress that took less was read from checkpoints, and says nothing of the pace
+SKIPPED = 0.1  # of the expected time: progress that took less was read from checkpoints, and says nothing of the pace
+TOGETHER_S = 1.0  # expected seconds that are judged together: several frames may be done at once, after a wait
 ENOUGH = 0.1  # of all work, after which the time left is estimated
 
 
@@ -76,6 +77,7 @@ class Course:
         self._seconds = [seconds for _, seconds in phases]
         self._clock, self._now, self._phase = clock, clock(), 0
         self._position = self._work = self._time = 0.0  # expected seconds that are done, those that were computed, and what they took
+        self._gained = self._took = 0.0  # of the progress that was not judged yet
 
     def step(self, phase: str, done: float, total: float) -> None:
         """Note the progress of a phase; unknown ones, and those that are over, change nothing."""
@@ -88,10 +90,12 @@ class Course:
         if gained <= 0:
             return
         now = self._clock()
-        took = now - self._now
-        if took > SKIPPED * gained:
-            self._work, self._time = self._work + gained, self._time + took
+        self._gained, self._took = self._gained + gained, self._took + now - self._now
         self._position, self._now = self._position + gained, now
+        if self._gained >= TOGETHER_S or self._position >= sum(self._seconds):
+            if self._took > SKIPPED * self._gained:
+                self._work, self._time = self._work + self._gained, self._time + self._took
+            self._gained = self._took = 0.0
 
     @property
     def fraction(self) -> float:

@@ -6,6 +6,7 @@ this name with anything else than a run moved there, such as edits, gets another
 """
 
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,8 @@ def keep(folder: Path, run: Mapping[str, Any], key: str) -> list[str]:
     except OSError as error:
         reason = f"Cannot move {error.filename}: {error.strerror or error}. Close the program that uses it, or choose another folder."
         raise InputError(reason) from error
-    return [*sentences, f"The body that was fitted before is kept in {place}, until the next finished one is replaced."]
+    scene = f"`tricap scene {shlex.quote(str(place))} --blend FILE.blend` makes its Blender file."
+    return [*sentences, f"The body that was fitted before is kept in {place}, until the next finished one is replaced; {scene}"]
 
 
 def _begun(place: Path, key: Any) -> bool:

@@ -139,12 +139,12 @@ def fit_warnings(body: BodyFit) -> list[str]:
         if len(frames) > FEW_FRAMES:
             warnings.append(
                 f"The place of the {limb} is guessed in {len(frames)} frames ({frame_list(frames)}), for the images do not show where it "
-                f"is: look at it there, and {_click(motion, limb, GUESSED)}, if a view shows it."
+                f"is: look at it there, and click {_joints(motion, limb, GUESSED)} in a frame in which a view shows it."
             )
         elif seen < LEAST_SEEN * len(row) and len(row) - seen > FEW_FRAMES:
             warnings.append(
-                f"The {limb} is seen well in {seen} of {len(row)} frames only, and inferred in the others: look at it, and where it is "
-                f"wrong {_click(motion, limb, INFERRED)}."
+                f"The {limb} is seen well in {seen} of {len(row)} frames only, and inferred or guessed in the others: look at it, and "
+                f"where it is wrong click {_joints(motion, limb, INFERRED)}."
             )
     for bone, frames in body.contradicted.items():
         if len(frames) > FEW_FRAMES:
@@ -157,10 +157,8 @@ def fit_warnings(body: BodyFit) -> list[str]:
     return warnings
 
 
-def _click(motion: BodyMotion, limb: str, word: str) -> str:
-    """What to click: "click wrist.L, best in frame 12"."""
-    joints, frame = to_click(motion.joint_names, motion.known, motion.frames.tolist(), limb, word)
-    return f"click {' and '.join(joints)}, best in frame {frame}"
+def _joints(motion: BodyMotion, limb: str, word: str) -> str:
+    return " and ".join(to_click(motion.joint_names, motion.known, limb, word))
 
 
 def limb_name(bone: str) -> str:

@@ -38,7 +38,7 @@ FORMAT, VERSION = "tricap-take", 1
 MOST_FRAMES = 100_000_000
 MOST_SEEDS = 1000  # clicked surface points, and corners of a polygon: what people click
 MOST_CORRECTIONS = 5000
-SIDED = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+SIDED = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe", "knuckles")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDED for s in "LR"))
 KEYS = (
     "format",
@@ -331,7 +331,7 @@ def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
 def _keyframes(tables: list[Mapping[str, Any]], seeds: FrameClicks, views: tuple[str, ...], where: str) -> tuple[FrameClicks, ...]:
     for table in tables:
         check_keys(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
-    keyframes = tuple(_frame_clicks(table, views, where) for table in tables)
+    keyframes = tuple(_frame_clicks(table, views, where, "keyframes") for table in tables)
     if len({k.frame for k in keyframes}) < len(keyframes):
         raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
     if seeds.joints and any(k.joints and k.frame == seeds.frame for k in keyframes):
@@ -366,14 +366,14 @@ def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) ->
     return Correction(kind=kind, view=view, frames=range(*frames), xy_px=np.array(corners, dtype=np.float64))
 
 
-def _frame_clicks(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> FrameClicks:
-    check_keys(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
+def _frame_clicks(table: Mapping[str, Any], views: tuple[str, ...], where: str, name: str = "seeds") -> FrameClicks:
+    check_keys(table, ("frame", "surface", "joints"), f"[{name}] of {where}")
     frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
     if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
-        raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
+        raise InputError(f"[{name}] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
     if len(surface) > MOST_SEEDS:
-        raise InputError(f"[seeds] of {where} has {len(surface)} surface seeds; {MOST_SEEDS} is the most. Without any, they are found.")
-    check_keys(joints, JOINTS, f"[seeds.joints] of {where}")
+        raise InputError(f"[{name}] of {where} has {len(surface)} surface seeds; {MOST_SEEDS} is the most. Without any, they are found.")
+    check_keys(joints, JOINTS, f"[{name}.joints] of {where}")
     return FrameClicks(
         frame=frame,
         surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),

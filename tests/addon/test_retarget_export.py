@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -12,10 +13,12 @@ import pytest
 
 from tricap.addon.command import main
 from tricap.addon.retarget.export import export_file
+from tricap.addon.retarget.files import open_motion
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import matrix_from_euler, shortest
 from tricap.core.motion.formats.bvh import read_bvh, write_bvh
+from tricap.core.motion.formats.gltf import sampled_fps
 from tricap.core.motion.formats.ply import write_mesh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.results.folder import Results
@@ -179,6 +182,20 @@ def test_the_full_models_names(empty: ModuleType, full_run: Path, tmp_path: Path
 @pytest.mark.parametrize("kind", ["bvh", "glb", "c3d"])
 def test_a_run_of_one_frame_goes_out(empty: ModuleType, full_run: Path, tmp_path: Path, kind: str) -> None:
     assert export_file(full_run, kind, tmp_path / f"a.{kind}", "plain", Monitor()).partition(", ")[0].endswith("1 frames")
+
+
+@pytest.mark.parametrize("fps", [30.0, 30000 / 1001, 50.0, 12.5])
+def test_a_motion_comes_back_from_gltf_with_all_of_its_frames(empty: ModuleType, wave_file: Path, tmp_path: Path, fps: float) -> None:
+    """glTF has times but no rate, and Blender imports at 24 images per second: 24 frames of 30 came back as 19."""
+    wave = replace(read_bvh(wave_file), fps=fps)
+    write_bvh(tmp_path / "a.bvh", wave)
+    export_file(tmp_path / "a.bvh", "glb", tmp_path / "a.glb", "plain", Monitor())
+    rate = sampled_fps(tmp_path / "a.glb")
+    back = open_motion(tmp_path / "a.glb", Monitor())
+    if fps == round(fps, 1) == 12.5:
+        assert rate is None, "no rate of video"
+    else:
+        assert rate == pytest.approx(fps, rel=1e-6) and back.fps == pytest.approx(fps, rel=1e-6) and len(back.frames) == len(wave.frames)
 
 
 def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_run: SmallRun, tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ MOST_BONES = 3000  # of a skin: Blender's time grows with their square
 MOST_ANIMATED = 1_000_000  # nodes times animations: the importer looks for every node in every animation
 MOST_VALUES = 10_000_000  # of all accessors, as often as they are used
 VALUES_PER_BYTE = 20  # for larger files
+MOST_FPS = 1000
+RATE_TOLERANCE = 1e-4  # of a rate: times are floats of 32 bits
 VALUES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 DAMAGE = (OSError, ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError)
@@ -84,6 +86,27 @@ def check_gltf(path: Path) -> None:
         )
     if values > most:
         raise InputError(f"{path} asks for {values} numbers, far more than it contains; it is damaged, export it again.")
+
+
+def sampled_fps(path: Path) -> float | None:
+    """The rate at which an animation has keys [1/s]: that of its curve with most keys, from the times of its first and last key, if it is a
+    rate of video. None: the keys are elsewhere. glTF has no rate of its own.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    table = read_table(path)
+    try:
+        accessors = table.get("accessors", [])
+        times = [accessors[sampler["input"]] for animation in table.get("animations", []) for sampler in animation["samplers"]]
+        longest = max(times, key=lambda accessor: int(accessor["count"]), default=None)
+        if longest is None or longest["count"] < 2 or not (seconds := float(longest["max"][0]) - float(longest["min"][0])) > 0:
+            return None
+        rate = (int(longest["count"]) - 1) / seconds
+    except DAMAGE as error:
+        raise unreadable(path, error) from error
+    video = min((round(rate), round(rate * 1.001) / 1.001), key=lambda fps: abs(fps - rate))
+    return video if 1 <= video <= MOST_FPS and abs(video - rate) < RATE_TOLERANCE * rate else None
 
 
 def _check_tree(nodes: list[dict[str, Any]]) -> None:

@@ -426,7 +426,6 @@ def test_a_frame_with_much_fewer_points_than_its_neighbours_is_named() -> None:
     assert not sudden_gaps([0], np.array([2000.0]))
 
 
-
 def test_steps_that_are_none() -> None:
     steady = 0.1 * np.exp(np.random.default_rng(0).normal(0, 0.1, 40))
     assert not sudden_step(list(range(40)), steady)

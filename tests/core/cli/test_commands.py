@@ -7,6 +7,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Course, Monitor
 from tricap.core.geometry.rig import read_rig
 from tricap.core.run import pipeline
+from tricap.core.run.settings import SETTINGS
 from tricap.core.take import writing
 from tricap.core.take.bar_file import read_bar, write_bar
 from tricap.core.take.footage import open_take
@@ -263,6 +265,21 @@ def test_progress_of_a_run_on_stderr_is_a_line_per_twentieth_with_the_time_left(
     lines = capfd.readouterr().err.splitlines()
     assert [line.split(" %")[0] for line in lines] == [str(5 * i) for i in range(21)]
     assert lines[0] == "0 % (surface)" and lines[12].endswith(" s left (surface)") and lines[13].endswith(" s left (skin)"), lines
+
+
+def test_all_settings_are_listed(capfd: Capture) -> None:
+    """There was no other list than the one in the message about a wrong name."""
+    assert main.main(["settings"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert "matching.patch_px=13 px   (5 to 51)" in lines
+    knobs = [f"{group}.{knob.name}" for group, settings in SETTINGS.items() for knob in fields(settings)]
+    assert [line.split("=")[0] for line in lines[::2]] == knobs and all(
+        line.startswith("    ") and line.endswith(".") for line in lines[1::2]
+    )
+    assert main.main(["settings", "skin"]) == 0
+    assert all(line.startswith(("skin.", "    ")) for line in capfd.readouterr().out.splitlines())
+    assert main.main(["settings", "fiting"]) == 2
+    assert "Did you mean “fitting”?" in capfd.readouterr().err
 
 
 def test_ctrl_c_stops_within_a_second_and_says_what_is_kept(take: Path, tmp_path: Path, capfd: Capture) -> None:

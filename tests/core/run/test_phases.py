@@ -23,7 +23,7 @@ def simulated(slower: dict[str, float], skipped: tuple[str, ...] = ()) -> list[t
     for stage in STAGES:
         for name, (once, each) in COST[stage].items():
             for i in range(FRAMES):
-                now[0] += (once + FRAMES * each) / FRAMES * (0.001 if name in skipped else slower.get(name, 1.0))
+                now[0] += (once + FRAMES * each) / FRAMES * (0.05 if name in skipped else slower.get(name, 1.0))
                 course.step(name, i + 1, FRAMES)
                 seen.append((now[0], course.fraction, course.seconds_left))
     end = now[0]
