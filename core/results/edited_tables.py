@@ -42,7 +42,7 @@ def keep(folder: Path, stages: Mapping[str, Any]) -> list[str]:
         try:
             kept = _copied_before(path)
             if kept is None:
-                store.write_bytes(part := path.with_name(f".{path.name}.part"), path.read_bytes())
+                store.write_bytes(part := path.with_name(f".{path.name}.part"), bounded.bytes_of(path, bounded.ARRAYS_BYTES))
                 kept = store.rename_to_free(part, edited_names(path))
         except OSError as error:
             reason = error.strerror or error

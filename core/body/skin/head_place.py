@@ -9,6 +9,10 @@ degree w to which they are the head's, smoothed over the neck:
 
 with Σ = diag(σ_p²), and more for a common scale; X, m a point and its normal in the head's axes, x' the nearest of those vertices whose
 normals are alike, renewed in every step. ρ is Tukey's biweight. A head on which few points were measured stays where it is.
+
+A bowed or turned head may be fitted in another direction, and its chin taken for the neck. So other places of the face are tried
+(OTHERS), and one of them is taken if it agrees clearly better with all points about the head, also those below it: if (1) with ρ of a
+fixed width and wider σ_p, a point without a vertex counting as an outlier, is less than CLEARLY of what it is where the fit has the face.
 """
 
 from collections.abc import Sequence
@@ -32,7 +36,18 @@ PRIOR = np.array([0.01, 0.03, 0.015, 0.1, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p 
 SIZE = 0.1  # … and what the three ln S have in common
 LEVEL = np.array([0.165, 0.0, 0.0])  # the anatomical head looks up by so much [rad], where a level one is registered to it
 JOINT_M = np.array([0.0, 0.020, -0.008])  # where the anatomical head turns on the neck, in the axes of the bone, before it is registered
-MOST_TURN = 0.45  # rad, of Q to the side
+MOST_TURN = 0.45  # rad, of Q to the side …
+MOST_FOUND = 1.2  # … where another place was clearly better
+OTHERS = [(up, aside) for up in (-0.1, 0.2, 0.5) for aside in (-0.9, -0.45, 0.0, 0.45, 0.9)]  # rad, of Q: places of the face that are tried
+NEAR = np.array([0.02, 0.05, 0.03, 0.15, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p about each of them
+WIDE = np.array([0.02, 0.05, 0.03, 0.35, 0.4, 0.15, 0.04, 0.04, 0.04])  # σ_p by which they are judged
+MARGIN_M = 0.1  # about the points: other vertices are none of theirs
+BELOW_M = 0.08  # the chin of a bowed head lies so far below the fitted one
+CLEARLY = 0.85
+JUDGED_M = 0.004  # σ by which they are judged
+MOST_TRIED, MOST_JUDGED = 2000, 6000  # points by which they are tried and judged: these stand for all
+FEW_STEPS = 8  # while they are tried
+REFINED = 3  # of them
 FARTHEST_M = 0.03  # of a point from the skin
 SIGMA_M = 0.003  # σ: what a face differs from the anatomical one
 EACH_FOR = 100.0  # as many points count as one: their errors are alike
@@ -53,6 +68,7 @@ class HeadPlace:
     R: np.ndarray  # (3, 3) axes of its bone in the rest pose
     head_m: np.ndarray  # (3,) where its bone begins there
     length_m: float  # of the bone
+    found: bool  # whether it was found where the fit has no face
 
     def moved(self, skin: OneSkin) -> OneSkin:
         """The skin of the rest pose with its head there."""
@@ -64,7 +80,7 @@ class HeadPlace:
 
         None if the head would be turned by more than a fit is wrong: then the points do not show the face.
         """
-        if abs(self.p[4]) > MOST_TURN:
+        if abs(self.p[4]) > (MOST_FOUND if self.found else MOST_TURN):
             return None
         joint, crown = _moved(np.stack([JOINT_M, [0.0, self.length_m, 0.0]]), self.head.middle, self.p)
         turn = vector_from_rotation(rotation_from_vector(self.p[3:6]) @ rotation_from_vector(LEVEL))
@@ -89,7 +105,11 @@ def registered_head(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     share = Nearby(skin.vertices_m, skin.faces).mean(weight[:, None])  # wider than the weights, or throat and nape would fold
     movable = _Movable(x=local, across=vertex_normals(skin.vertices_m, skin.faces) @ R, share=share, own=own > OWN)
     p = _registered(movable, points, normals)
-    return None if p is None else HeadPlace(head=movable, p=p, R=R, head_m=head, length_m=float(shape.lengths_m[b]))
+    if p is None:
+        return None
+    other = _elsewhere(movable, *_in_head(shape, b, frames, local[own > OWN], BELOW_M), p)
+    place = p if other is None else other
+    return HeadPlace(head=movable, p=place, R=R, head_m=head, length_m=float(shape.lengths_m[b]), found=other is not None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -111,9 +131,12 @@ class _Movable:
         return np.asarray(self.x + self.share * (_moved(self.x, self.middle, p) - self.x))
 
 
-def _in_head(shape: BodyShape, b: int, frames: Sequence[SurfacePoints], vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points near the head and their normals (N, 3), in the axes of its bone."""
+def _in_head(
+    shape: BodyShape, b: int, frames: Sequence[SurfacePoints], vertices: np.ndarray, below_m: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points near the head and their normals (N, 3), in the axes of its bone; also those so far `below_m` it."""
     low, high = vertices.min(axis=0) - FARTHEST_M, vertices.max(axis=0) + FARTHEST_M
+    low[1] -= below_m
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int))
     points, normals = [], []
     for frame in (frames[i] for i in chosen):
@@ -143,28 +166,77 @@ def _derivatives(x: np.ndarray, middle: np.ndarray, p: np.ndarray) -> np.ndarray
     return np.concatenate([shift, -cross_matrix(scaled @ Q.T), Q * scaled[:, None]], axis=2)
 
 
-def _registered(skin: _Movable, points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
-    """p (9,) of (1); None if too few points find a vertex."""
-    from scipy.spatial import cKDTree
-
-    p, rows = MEAN, np.arange(len(points))
-    common = np.repeat([0.0, SIZE], (6, 3))
-    information = np.linalg.inv(np.diag(PRIOR**2) + np.outer(common, common))
-    for _ in range(STEPS):
+def _registered(
+    skin: _Movable,
+    points: np.ndarray,
+    normals: np.ndarray,
+    stand_for: int = 1,
+    *,
+    mean: np.ndarray = MEAN,
+    sigma: np.ndarray = PRIOR,
+    steps: int = STEPS,
+    start: np.ndarray | None = None,
+) -> np.ndarray | None:
+    """p (9,) of (1), with this mean and these σ_p; None if too few points find a vertex. Each of the points `stand_for` several."""
+    p, information = mean if start is None else start, _information(sigma)
+    for _ in range(steps):
         at = skin.at(p)
-        distance, near = cKDTree(at).query(points, k=CANDIDATES, distance_upper_bound=FARTHEST_M)
-        near = np.minimum(near, len(at) - 1)
-        cosine = np.einsum("nkc,nc->nk", skin.across[near] @ rotation_from_vector(p[3:6]).T, normals)
-        best = np.argmin(np.where(cosine > LEAST_COSINE, distance * (2 - cosine), np.inf), axis=1)
-        found = near[rows, best]
-        good = np.flatnonzero(np.isfinite(distance[rows, best]) & (cosine[rows, best] > LEAST_COSINE) & skin.own[found])
-        if len(good) < FEWEST:
+        found, r = _residuals(skin, at, p, points, normals)
+        good = np.flatnonzero(np.isfinite(r) & skin.own[found])
+        if len(good) * stand_for < FEWEST:
             return None
-        n, i = normals[good], found[good]
-        r = np.einsum("nk,nk->n", n, points[good] - at[i])
+        n, i, r = normals[good], found[good], r[good]
         J = skin.share[i] * np.einsum("nk,nkp->np", n, _derivatives(skin.x[i], skin.middle, p))
         spread = max(SIGMA_M, 1.4826 * float(np.median(np.abs(r))))
-        weight = np.clip(1 - (r / (TUKEY * spread)) ** 2, 0, None) ** 2 / (EACH_FOR * spread**2)
+        weight = np.clip(1 - (r / (TUKEY * spread)) ** 2, 0, None) ** 2 * stand_for / (EACH_FOR * spread**2)
         normal = J.T @ (weight[:, None] * J) + information
-        p = _changed(p, np.linalg.solve(normal, J.T @ (weight * r) - information @ (p - MEAN)))
+        p = _changed(p, np.linalg.solve(normal, J.T @ (weight * r) - information @ (p - mean)))
     return p
+
+
+def _information(sigma: np.ndarray) -> np.ndarray:
+    """Σ⁻¹ of (1)."""
+    common = np.repeat([0.0, SIZE], (6, 3))
+    return np.linalg.inv(np.diag(sigma**2) + np.outer(common, common))
+
+
+def _residuals(skin: _Movable, at: np.ndarray, p: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertex (N,) to which each point belongs, of those that are `at`, and its distance (N,) along the normal; inf without one."""
+    from scipy.spatial import cKDTree
+
+    rows = np.arange(len(points))
+    distance, near = cKDTree(at).query(points, k=CANDIDATES, distance_upper_bound=FARTHEST_M)
+    near = np.minimum(near, len(at) - 1)
+    cosine = np.einsum("nkc,nc->nk", skin.across[near] @ rotation_from_vector(p[3:6]).T, normals)
+    best = np.argmin(np.where(cosine > LEAST_COSINE, distance * (2 - cosine), np.inf), axis=1)
+    found = near[rows, best]
+    good = np.isfinite(distance[rows, best]) & (cosine[rows, best] > LEAST_COSINE)
+    return found, np.where(good, np.einsum("nk,nk->n", normals, points - at[found]), np.inf)
+
+
+def _elsewhere(skin: _Movable, points: np.ndarray, normals: np.ndarray, p: np.ndarray) -> np.ndarray | None:
+    """Another place of the head that agrees clearly better with the points about it than p (9,) does; None if there is none."""
+    low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+    near = skin.own | ((skin.x > low) & (skin.x < high)).all(axis=1)
+    skin = _Movable(x=skin.x[near], across=skin.across[near], share=skin.share[near], own=skin.own[near])
+    every, some = -(-len(points) // MOST_JUDGED), -(-len(points) // MOST_TRIED)
+    few, judged = (points[::some], normals[::some], some), (points[::every], normals[::every], every)
+
+    def cost(p: np.ndarray) -> float:
+        """(1), as places are judged."""
+        _, r = _residuals(skin, skin.at(p), p, *judged[:2])
+        agrees = np.clip(1 - (r / (TUKEY * JUDGED_M)) ** 2, 0, None) ** 3
+        return float(TUKEY**2 / 3 / EACH_FOR * every * (1 - agrees).sum() + (p - MEAN) @ _information(WIDE) @ (p - MEAN))
+
+    tried = []
+    for up, aside in OTHERS:
+        mean = np.array([0.0, 0.0, 0.0, up, aside, 0.0, 0.0, 0.0, 0.0])
+        if (other := _registered(skin, *few, mean=mean, sigma=NEAR, steps=FEW_STEPS)) is not None:
+            tried.append(other)
+    tried = sorted(tried, key=cost)[:REFINED]
+    further = [_registered(skin, *judged, sigma=WIDE, start=start) for start in tried]
+    places = [*tried, *(place for place in further if place is not None)]
+    if not places:
+        return None
+    best = min(places, key=cost)
+    return best if cost(best) < CLEARLY * cost(p) else None

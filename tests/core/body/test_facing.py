@@ -153,6 +153,27 @@ def test_a_face_tells_where_the_head_looks(person) -> None:
     )
 
 
+def _few_points(shape: BodyShape, skin: OneSkin, turn_deg: tuple[float, float, float]) -> list[SurfacePoints]:
+    """As many as a take shows: some thousands, of all frames together."""
+    frames = _points(shape, skin, np.radians(turn_deg))
+    return [replace(p, xyz_m=p.xyz_m[i::24], normals=p.normals[i::24], sigma_m=p.sigma_m[i::24]) for i, p in enumerate(frames)]
+
+
+@pytest.mark.parametrize("turn_deg", [(25.0, 0.0, 0.0), (20.0, -35.0, 5.0)])
+def test_a_bowed_and_turned_face_is_found_where_the_fit_has_none(person, turn_deg: tuple[float, float, float]) -> None:
+    """The search began at one place alone: the head of somebody who looked down became a third too large, its face on the forehead."""
+    shape, skin = person
+    place = registered_head(skin, shape, _few_points(shape, skin, turn_deg))
+    assert place.found
+    np.testing.assert_allclose(np.degrees(place.p[3:6]), turn_deg, atol=3.0)
+    assert np.abs(place.p[6:]).max() < 0.03 and place.facing is not None
+
+
+def test_a_face_that_is_where_the_fit_has_it_is_not_looked_for(person) -> None:
+    shape, skin = person
+    assert not registered_head(skin, shape, _few_points(shape, skin, (-24.0, 12.0, 3.0))).found
+
+
 @pytest.mark.slow
 def test_points_that_do_not_show_the_face_tell_nothing(person) -> None:
     shape, skin = person
