@@ -195,6 +195,7 @@ def test_a_faulty_place_of_a_joint_is_refused(tmp_path: Path, line: str, said: s
         ("prior_sigma_deg = 60.0", "prior_sigma_deg = 0", "“shoulder.R twist”.*sigma above 0"),
         ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [0, 0, 0]", "radii_m of “upper_arm.R”"),
         ("radii_m = [0.052, 0.046, 0.041]", "radii_m = [1e9, 1, 1]", "radii_m of “upper_arm.R”"),
+        ("radii_m = [0.052", "radius_sigma = 2\nradii_m = [0.052", "radius_sigma of “upper_arm.R” is no share"),
         ("surface = [", "surface = [0.9, 0.3] # [", "surface of “upper_arm.R” is 0.9 to 0.3"),
         ('base = "', 'base = "zz" # "', "base is .*zz.*shoulder.R"),
     ],

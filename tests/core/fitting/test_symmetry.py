@@ -10,7 +10,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.inputs.fit_input import FitInput
-from tricap.core.fitting.observations import Symmetry
+from tricap.core.fitting.observations import ShapePrior, Symmetry
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages.sequence import fit_context, fit_sequence
 
@@ -51,3 +51,14 @@ def test_clicks_make_one_shin_longer_only_where_people_may_be_uneven() -> None:
         right, left = (fit.shape.lengths_m[names.index(f"shin.{side}")] for side in "RL")
         longer.append(right / left - 1)
     assert longer[0] > 0.03 and abs(longer[1]) < longer[0] / 2
+
+
+def test_skulls_are_more_alike_than_flesh() -> None:
+    """A bowed head was blown up by a third: its radii were as free as a belly's."""
+    fit = fit_context(clicked_person(1.0), FitSettings(radius_sigma=0.3))
+    prior = next(x for x in fit.shape_observations() if isinstance(x, ShapePrior))
+    balls = fit.parameters.template.metaballs
+    bones = np.array([bone.name for bone in fit.model.skeleton.bones])[balls.bone_index]
+    sigma = prior.sigma[fit.parameters.layout.group("radii")].reshape(len(bones), 2)
+    for name, own in (("head", 0.06), ("neck", 0.08), ("thigh.L", 0.3), ("chest", 0.3)):
+        assert (sigma[bones == name] == own).all(), name
