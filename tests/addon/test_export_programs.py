@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +18,7 @@ import pytest
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.export import export_file, exporting_played, named_for, points_of
+from tricap.addon.retarget.files import rate_of_gltf
 from tricap.addon.retarget.playing import reading_played
 from tricap.addon.retarget.read import ended
 from tricap.addon.scene.standing import Path as Carrier
@@ -43,13 +45,14 @@ def imported(bpy: ModuleType, file: Path, fps: float) -> None:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base = 30, 30 / fps
-    {
-        ".fbx": lambda f: bpy.ops.import_scene.fbx(filepath=f),
-        ".glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
-        ".usd": lambda f: bpy.ops.wm.usd_import(filepath=f),
-        ".usda": lambda f: bpy.ops.wm.usd_import(filepath=f),
-        ".abc": lambda f: bpy.ops.wm.alembic_import(filepath=f, as_background_job=False),
-    }[file.suffix](str(file))
+    with rate_of_gltf(scene) if file.suffix == ".glb" else nullcontext():  # Blender's importer has it wrong
+        {
+            ".fbx": lambda f: bpy.ops.import_scene.fbx(filepath=f),
+            ".glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
+            ".usd": lambda f: bpy.ops.wm.usd_import(filepath=f),
+            ".usda": lambda f: bpy.ops.wm.usd_import(filepath=f),
+            ".abc": lambda f: bpy.ops.wm.alembic_import(filepath=f, as_background_job=False),
+        }[file.suffix](str(file))
 
 
 def skinned(bpy: ModuleType) -> tuple[Any, Any]:
