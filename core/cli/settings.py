@@ -25,10 +25,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _described(group: str, knob: "dataclasses.Field[Any]") -> list[str]:
     about = knob.metadata
-    limits = " or ".join(about["choices"])
-    if not limits and (about["low"] is not None or about["high"] is not None):
-        limits = " to ".join(f"{end:g}" for end in (about["low"], about["high"]) if end is not None)
-        limits = limits if None not in (about["low"], about["high"]) else f"{'from' if about['high'] is None else 'up to'} {limits}"
+    low, high, limits = about["low"], about["high"], " or ".join(about["choices"])
+    if low is not None or high is not None:
+        limits = f"{low:g} to {high:g}" if None not in (low, high) else f"from {low:g}" if high is None else f"up to {high:g}"
     unit = f" {about['unit']}" if about["unit"] else ""
     value = knob.default if isinstance(knob.default, str) else json.dumps(knob.default)
     return [f"{group}.{knob.name}={value}{unit}" + (f"   ({limits})" if limits else ""), f"    {about['about']}"]
