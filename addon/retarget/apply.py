@@ -15,7 +15,7 @@ from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig, controls_of
 from ...core.motion.retarget.transfer import lowest_m, stood_up
-from ..scene.build import set_rate
+from ..scene.frame_rate import set_rate
 from . import saved_maps
 from .programs import presets
 from .read import read_motion, read_rig, with_soles

@@ -24,7 +24,7 @@ from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
 from ...core.results.folder import check_complete
 from ..scene.armature import ROLES_KEY, SNAPS_KEY
-from ..scene.build import set_rate
+from ..scene.frame_rate import set_rate
 from .build import build_armature
 from .programs import is_imported_by_blender
 from .read import action_frames, read_motion, read_rig, with_residual_motion

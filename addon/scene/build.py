@@ -3,7 +3,6 @@
 read_contents (any thread) → write_scene (main thread) → save_blend
 """
 
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -30,6 +29,7 @@ from ...core.take.footage import Footage
 from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, stored, surroundings
 from .cloud import CloudPoints, add_cloud, pixel_size_m
 from .contents import Contents, read_contents
+from .frame_rate import set_rate
 from .looking import look_at
 from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, POINTS_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
@@ -185,12 +185,6 @@ def _keep_corrections(rig: bpy.types.Object) -> str:
         return ""
     corrections.use_fake_user = True
     return f"; its action “{corrections.name}” is kept"
-
-
-def set_rate(scene: bpy.types.Scene, fps: float) -> None:
-    """Give the scene a frame rate, which need not be a whole number."""
-    whole = max(1, math.ceil(fps - 1e-3))
-    scene.render.fps, scene.render.fps_base = whole, whole / fps
 
 
 def set_time(scene: bpy.types.Scene, contents: Contents) -> None:

@@ -330,7 +330,8 @@ def test_a_copy_of_large_footage_is_not_read(
     assert words().split()[3:7] == ["stale", "stale", "stale", "stale"]
     files = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.ply")}
     assert blender.ops.tricap.run() == {"FINISHED"} and words().split()[3:7] == ["done", "done", "done", "done"]
-    assert files == {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.ply")}
+    now = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.ply")}
+    assert files == {path: content for path, content in now.items() if "earlier_body" not in path.parts}
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert not any("content" in stage for stage in run["stages"].values())
 
