@@ -37,7 +37,7 @@ class StartJoints:
         return (
             f"It is not certain how the person stands in frame {self.frame} ({self.probability:.0%}): {' or '.join(doubts[:2])}. "
             f"Click the {side}{self.ask.partition('.')[0]} in two views of frame {self.frame}, or three of neck, shoulders, pelvis and "
-            "hips, which always suffice; then run it again."
+            "hips, which always suffice; then run it again. After one click it may ask for another."
         )
 
 
