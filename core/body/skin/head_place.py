@@ -12,7 +12,8 @@ normals are alike, renewed in every step. ρ is Tukey's biweight. A head on whic
 
 A bowed or turned head may be fitted in another direction, and its chin taken for the neck. So other places of the face are tried
 (OTHERS), and one of them is taken if it agrees clearly better with all points about the head, also those below it: if (1) with ρ of a
-fixed width and wider σ_p, a point without a vertex counting as an outlier, is less than CLEARLY of what it is where the fit has the face.
+fixed width and wider σ_p, a point without a vertex counting as an outlier, is less than CLEARLY of what it is where the fit has the face,
+and so is the median misfit of the points that have one (a head pushed down over the neck leaves none without a vertex, and fits nothing).
 """
 
 from collections.abc import Sequence
@@ -43,7 +44,7 @@ NEAR = np.array([0.02, 0.05, 0.03, 0.15, 0.25, 0.1, 0.04, 0.04, 0.04])  # σ_p a
 WIDE = np.array([0.02, 0.05, 0.03, 0.35, 0.4, 0.15, 0.04, 0.04, 0.04])  # σ_p by which they are judged
 MARGIN_M = 0.1  # about the points: other vertices are none of theirs
 BELOW_M = 0.08  # the chin of a bowed head lies so far below the fitted one
-CLEARLY = 0.85  # what another place may cost of what the fit's does
+CLEARLY = 0.85  # what another place may cost, and misfit, of what the fit's does
 JUDGED_M = 0.004  # σ by which they are judged
 MOST_TRIED, MOST_JUDGED = 2000, 6000  # points by which they are tried and judged: these stand for all
 FEW_STEPS = 8  # while they are tried
@@ -222,11 +223,18 @@ def _elsewhere(skin: _Movable, points: np.ndarray, normals: np.ndarray, p: np.nd
     every, some = -(-len(points) // MOST_JUDGED), -(-len(points) // MOST_TRIED)
     few, judged = (points[::some], normals[::some], some), (points[::every], normals[::every], every)
 
+    def residuals(p: np.ndarray) -> np.ndarray:
+        return _residuals(skin, skin.at(p), p, *judged[:2])[1]
+
     def cost(p: np.ndarray) -> float:
         """(1), as places are judged."""
-        _, r = _residuals(skin, skin.at(p), p, *judged[:2])
-        agrees = np.clip(1 - (r / (TUKEY * JUDGED_M)) ** 2, 0, None) ** 3
+        agrees = np.clip(1 - (residuals(p) / (TUKEY * JUDGED_M)) ** 2, 0, None) ** 3
         return float(TUKEY**2 / 3 / EACH_FOR * every * (1 - agrees).sum() + (p - MEAN) @ _information(WIDE) @ (p - MEAN))
+
+    def misfit_m(p: np.ndarray) -> float:
+        """Of the points that belong to a vertex, the median."""
+        r = np.abs(residuals(p))
+        return float(np.median(r[np.isfinite(r)])) if np.isfinite(r).any() else np.inf
 
     tried = []
     for up, aside in OTHERS:
@@ -239,4 +247,4 @@ def _elsewhere(skin: _Movable, points: np.ndarray, normals: np.ndarray, p: np.nd
     if not places:
         return None
     best = min(places, key=cost)
-    return best if cost(best) < CLEARLY * cost(p) else None
+    return best if cost(best) < CLEARLY * cost(p) and misfit_m(best) < CLEARLY * misfit_m(p) else None
