@@ -31,10 +31,10 @@ from ...core.motion.retarget.rig import Motion
 from ...core.results.folder import check_inside
 from ...core.results.outputs import check_replaceable
 from ..scene import skin
+from ..scene.frame_rate import rate_of_gltf
 from ..scene.standing import has_feet
 from . import playing, programs
 from .build import build_armature
-from .files import rate_of_gltf
 from .own_textures import own_textures
 from .programs import Program, bone_names
 
@@ -199,25 +199,21 @@ def _fbx(path: str, program: Program) -> None:
 
 def _glb(path: str, program: Program) -> None:
     with rate_of_gltf(bpy.context.scene):
-        _write_glb(path)
-
-
-def _write_glb(path: str) -> None:
-    bpy.ops.export_scene.gltf(
-        filepath=path,
-        export_format="GLB",
-        use_active_scene=True,
-        export_yup=True,
-        export_animations=True,
-        export_animation_mode="ACTIVE_ACTIONS",
-        export_nla_strips_merged_animation_name="Motion",
-        export_force_sampling=True,
-        export_frame_range=True,
-        export_optimize_animation_size=False,
-        export_rest_position_armature=True,
-        export_def_bones=False,
-        export_apply=False,
-    )
+        bpy.ops.export_scene.gltf(
+            filepath=path,
+            export_format="GLB",
+            use_active_scene=True,
+            export_yup=True,
+            export_animations=True,
+            export_animation_mode="ACTIVE_ACTIONS",
+            export_nla_strips_merged_animation_name="Motion",
+            export_force_sampling=True,
+            export_frame_range=True,
+            export_optimize_animation_size=False,
+            export_rest_position_armature=True,
+            export_def_bones=False,
+            export_apply=False,
+        )
 
 
 def _usd(path: str, program: Program) -> None:

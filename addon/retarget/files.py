@@ -24,7 +24,7 @@ from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
 from ...core.results.folder import check_complete
 from ..scene.armature import ROLES_KEY, SNAPS_KEY
-from ..scene.frame_rate import set_rate
+from ..scene.frame_rate import rate_of_gltf, set_rate
 from .build import build_armature
 from .programs import is_imported_by_blender
 from .read import action_frames, read_motion, read_rig, with_residual_motion
@@ -59,18 +59,6 @@ def open_rig(path: Path) -> None:
         set_rate(bpy.context.scene, fps)
     with rate_of_gltf(bpy.context.scene):
         import_rig(path)
-
-
-@contextmanager
-def rate_of_gltf(scene: bpy.types.Scene) -> Iterator[None]:
-    """The rate by which Blender's importer and exporter of glTF compute times: they multiply by the base by which a rate is divided."""
-    render = scene.render
-    base = render.fps_base
-    render.fps_base = 1 / base
-    try:
-        yield
-    finally:
-        render.fps_base = base
 
 
 @contextmanager

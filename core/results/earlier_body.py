@@ -36,21 +36,19 @@ def keep(folder: Path, run: Mapping[str, Any], key: str) -> list[str]:
     stages = {name: dict(entry) for name, entry in run.get("stages", {}).items() if name in STAGES}
     if "fit" not in stages or "not_done" in stages["fit"]:
         return []
-    place, record = folder / EARLIER, {name: value for name, value in run.items() if name not in NOT_ITS_OWN}
-    files = {name: size for name, size in run.get("files", {}).items() if name in NAMES}
-    begun = _begun(place, stages["fit"].get("key"))  # by a run that was killed
-    if stages["fit"].get("key") == key:
-        if begun:
-            _remove(place)
-        return []
-    if not begun and "fit" in lost(folder, run):
-        return []
+    place, own_key = folder / EARLIER, stages["fit"].get("key")
+    begun, sentences = _begun(place, own_key), list[str]()  # by a run that was killed
     try:
-        sentences = [] if begun else _make_room(place)
+        if own_key == key:
+            if begun:
+                _remove(place)
+            return []
         if not begun:
-            stages["fit"][edited_tables.ENTRY] = edited_tables.digests(folder)
+            if "fit" in lost(folder, run):
+                return []
+            sentences = _make_room(place)
             place.mkdir()
-            store.write_json(place / RUN, record | {UNTIL: "fit", "stages": stages, "files": files})
+            store.write_json(place / RUN, _record(folder, run, stages))
         for name in NAMES:
             _move(folder / name, place / name)
     except OSError as error:
@@ -58,6 +56,13 @@ def keep(folder: Path, run: Mapping[str, Any], key: str) -> list[str]:
         raise InputError(reason) from error
     scene = f"`tricap scene {shlex.quote(str(place))} --blend FILE.blend` makes its Blender file."
     return [*sentences, f"The body that was fitted before is kept in {place}, until the next finished one is replaced; {scene}"]
+
+
+def _record(folder: Path, run: Mapping[str, Any], stages: dict[str, Any]) -> dict[str, Any]:
+    """The run.json of an earlier body, from that of the results in `folder`; its tables count as unedited as they are now."""
+    stages["fit"][edited_tables.ENTRY] = edited_tables.digests(folder)
+    files = {name: size for name, size in run.get("files", {}).items() if name in NAMES}
+    return {name: value for name, value in run.items() if name not in NOT_ITS_OWN} | {UNTIL: "fit", "stages": stages, "files": files}
 
 
 def _begun(place: Path, key: Any) -> bool:

@@ -25,7 +25,6 @@ from .step import HARMLESS_M, TrackingView, measured_at
 from .templates import Templates
 from .tracked import TrackedFrame, joined, nothing, rows_of
 
-BODY_FRAMES = 4  # after which a body's prediction is as uncertain as it becomes: its errors do not add up
 MIN_MEMBERS = 4  # neighbours that share a motion which can carry a point
 
 
@@ -130,8 +129,7 @@ class LostPoints:
         shift = key.xy - centre[:, ref]
         at = [key.xy if k == ref else centre[:, k] + np.einsum("nij,nj->ni", p.shape[:, k], shift) for k in range(len(view.cameras))]
         found, verdict = measured_at(view, replace(p, key_shape=key.shape, drift=key.covariance), at, images, status)
-        frames = np.where(self.by_body, np.minimum(self.lost_frames, BODY_FRAMES), self.lost_frames)
-        far = np.linalg.norm(found.xyz_m - p.xyz_m, axis=1) > np.sqrt(frames) * 1e-3 * view.tracking.max_deviation_mm
+        far = np.linalg.norm(found.xyz_m - p.xyz_m, axis=1) > np.sqrt(self.lost_frames) * 1e-3 * view.tracking.max_deviation_mm
         return found.select((verdict == TrackStatus.MEASURED) & ~far)
 
 

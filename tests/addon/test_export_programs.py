@@ -18,9 +18,9 @@ import pytest
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.export import export_file, exporting_played, named_for, points_of
-from tricap.addon.retarget.files import rate_of_gltf
 from tricap.addon.retarget.playing import reading_played
 from tricap.addon.retarget.read import ended
+from tricap.addon.scene.frame_rate import rate_of_gltf
 from tricap.addon.scene.standing import Path as Carrier
 from tricap.addon.scene.standing import carry_path, dofs_of
 from tricap.core.foundation.errors import InputError

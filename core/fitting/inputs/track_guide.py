@@ -33,7 +33,7 @@ class BodyGuide:
         self.longest_frames = round(WAIT_S * footage.take.fps)
         balls = body.shape.metaballs
         parts = (body.motion.frames, body.motion.values, body.shape.lengths_m, balls.centre, balls.radii_m, balls.weight)
-        self.key = store.digest("guide 3", *(np.ascontiguousarray(part).tobytes() for part in parts))
+        self.key = store.digest("guide 2", *(np.ascontiguousarray(part).tobytes() for part in parts))
 
     def bind(self, frame: int, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The bone (N,) of each point (N, 3) of a frame, −1 for none, and the point in the bone's axes (N, 3).  (1)"""

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import read_model
 from tricap.core.foundation.errors import InputError
 from tricap.core.images.sequence import ImageFiles
 from tricap.core.take.footage import open_take
-from tricap.core.take.take import AUTO_BODY, Take, read_take
+from tricap.core.take.take import AUTO_BODY, JOINTS, Take, read_take
 
 HEAD = dict(format='"tricap-take"', version="1", fps="25.0", rig='"rig.toml"')
 CORNER = "[1, 2], "
@@ -201,6 +202,10 @@ FAULTS = {
     "limits turned": (text(more='[body.limits]\n"knee.R flexion" = [140, 0]\n'), "limits of “knee.R flexion” in .* are \\[140, 0\\]"),
     "keyframes a table": (text(more="[keyframes]\nframe = 3\n"), "must be written as \\[\\[keyframes\\]\\] tables"),
     "two keyframes alike": (text(more=KEYFRAME + KEYFRAME), "Two \\[\\[keyframes\\]\\] of .* are for the same frame"),
+    "unknown joint of a keyframe": (
+        text(more='[[keyframes]]\nframe = 3\n[keyframes.joints]\n"knuckle.R" = { L = [1, 2] }\n'),
+        "\\[keyframes.joints\\] of .* has an unknown key “knuckle.R”. Did you mean “knuckles.R”",
+    ),
     "surface in a keyframe": (text(more="[[keyframes]]\nframe = 3\nsurface = []\n"), "unknown key “surface”"),
     "a keyframe for the frame of the seeds": (
         text(more=KEYFRAME + '[seeds]\nframe = 3\n[seeds.joints]\n"wrist.R" = { L = [5, 5] }\n'),
@@ -230,6 +235,11 @@ def test_faults(tmp_path: Path, fault: str) -> None:
     with pytest.raises(InputError, match=said) as error:
         read(tmp_path / "the take", content)
     assert "the take" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_every_joint_of_the_body_but_its_top_can_be_clicked() -> None:
+    """The report named the knuckles as least certain, and their clicks were refused."""
+    assert {*read_model("full").skeleton.joint_names} == {*JOINTS, "crown"}
 
 
 def test_folders_that_are_no_take(tmp_path: Path) -> None:
