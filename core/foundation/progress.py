@@ -106,7 +106,7 @@ class Course:
     def seconds_left(self) -> float | None:
         """The time left; None as long as too little was computed for an estimate."""
         left = sum(self._seconds) - self._position
-        if self._work < ENOUGH * (self._work + left):
+        if not self._work or self._work < ENOUGH * (self._work + left):
             return None
         return max(0.0, self._time / self._work * left - (self._clock() - self._now))
 

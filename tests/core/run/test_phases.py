@@ -51,6 +51,12 @@ def test_what_was_read_from_checkpoints_says_nothing_of_the_pace() -> None:
     assert any(left is not None for _, _, left in seen)
 
 
+def test_a_run_of_checkpoints_alone_has_no_pace() -> None:
+    course = Course([("surface", 10.0)], clock=lambda: 0.0)
+    course.step("surface", 1, 1)
+    assert course.fraction == 1.0 and course.seconds_left is None
+
+
 def test_unknown_and_earlier_phases_change_nothing() -> None:
     course = course_of(STAGES, FRAMES)
     course.step("tracks", 1, 2)
