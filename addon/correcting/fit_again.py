@@ -63,7 +63,7 @@ class FitAgain(StageOperator, bpy.types.Operator):
         _mark_again(context.scene)
         canvas.redraw_clips(context)
         context.scene.frame_set(context.scene.frame_current)
-        self.report({"INFO"}, str(result))
+        self.report({"INFO"}, f"{result} Fit Body also adjusts the shape.")
         for _, rig in _controlled(context.scene):
             self.report({"INFO"}, f"The base layer of “{rig.name}” plays these frames as they are now; its corrections are as before.")
         return {"FINISHED"}

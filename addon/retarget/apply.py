@@ -21,7 +21,7 @@ from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, store_residual_motion, write_action
 
-FLOOR_AT_ORIGIN = 0.1  # fraction of a rig's height: if its feet are nearer to its origin, the floor is at the origin, else under its feet
+FLOOR_AT_ORIGIN = 0.1  # fraction of a rig's height, by which its feet may miss the floor at its origin
 CHECKED_FRAMES = 9  # of the action, spread evenly
 TOLERANCE_DEG = 0.5  # between the pose that was keyed and the one that Blender plays
 
@@ -84,11 +84,13 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
 
 
 def _floor_m(rig: Rig, rig_map: RigMap, origin_m: float) -> float:
-    """The height of the floor under a rig as it stands, whose origin is at this height."""
+    """The height of the floor under a rig as it stands, whose origin is at this height: that of the origin, where the feet are, or else
+    their own. A rig whose origin is in its pelvis and at
+    height 0 was not put on its feet: it is to stand on the scene's floor."""
     if stood_up(rig, rig_map) is not rig:
         return 0.0
-    low = lowest_m(rig)
-    return origin_m if abs(low - origin_m) < FLOOR_AT_ORIGIN * rig.height_m else low
+    low, near = lowest_m(rig), FLOOR_AT_ORIGIN * rig.height_m
+    return origin_m if min(abs(low - origin_m), abs(origin_m)) < near else low
 
 
 def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:

@@ -115,6 +115,8 @@ def _stages(commands: Any) -> None:
         parser.add_argument(
             "--quality", dest="set", action="append", type="surface.quality={}".format, metavar="motion|surface", help=about
         )
+    about = "fit only the 0.4 s around joints whose clicks were added, moved or removed since the fit; the shape stays"
+    fit.add_argument("--around-clicks", action="store_true", help=about)
     track.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
     track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
     track.add_argument("--pictures", type=Path, metavar="DIR", help="with --points: also draw the points and their paths over the images")

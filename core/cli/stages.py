@@ -9,10 +9,11 @@ from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
 from ..report.film import write_film
 from ..results import blend_file, films
-from ..results.folder import check_separate_folder
+from ..results.folder import Results, check_separate_folder
 from ..results.own_files import CACHE
 from ..results.run_json import UNTIL, notes_of
 from ..run import pipeline, take_run
+from ..run.around_clicks import fit_around_clicks
 from ..run.engine import Engine, of_this_machine
 from ..run.settings import settings_of
 from ..surface.resolution import measured_footage, person_seen
@@ -60,8 +61,22 @@ def track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """The body's shape and motion."""
-    return _stages(("fit",), args, monitor)
+    """The body's shape and motion, or the motion around new clicks alone."""
+    return _fit_around_clicks(args, monitor) if args.around_clicks else _stages(("fit",), args, monitor)
+
+
+def _fit_around_clicks(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    refuse_unused({"--frames": args.frames is not None, "--restart": args.restart}, "is of a whole fit; leave out --around-clicks")
+    if not (args.out / "body.toml").is_file():
+        raise InputError(f"There is no fitted body in {args.out}; fit all frames first, without --around-clicks.")
+    found = fit_around_clicks(args.take, args.out, overrides(args.set), monitor)
+    if found is None:
+        raise InputError(
+            "More than the clicks of fitted frames has changed since the body was fitted; fit all frames, without --around-clicks."
+        )
+    if args.json:
+        return [json.dumps(Results(args.out).read_run(), indent=1, ensure_ascii=False)]
+    return [f"{args.out}: {found} `tricap scene` builds the Blender file anew; a whole fit also adjusts the shape and renews the report."]
 
 
 def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) -> list[str]:

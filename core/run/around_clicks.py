@@ -67,7 +67,7 @@ class FittedAgain:
     joints: JointTable
 
     def __str__(self) -> str:
-        return f"Frames {frame_list(self.frames.tolist())} were fitted again, with the shape as it was. Fit Body also adjusts the shape."
+        return f"Frames {frame_list(self.frames.tolist())} were fitted again, with the shape as it was."
 
 
 def fitted_with(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, Any]:
@@ -119,7 +119,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
             return None
         changed = _changed(before.get("clicks", {}), now["clicks"])
         if not changed:
-            raise InputError("No joints were clicked or pulled since the body was fitted; drag a joint first.")
+            raise InputError("No joints were clicked or pulled since the body was fitted; click or pull one first.")
         body = _Body.read(results, _fitted_model(take, record["stages"]["fit"]))
         stretches = around([*changed], body.motion.frames, body.motion.time_s)
         if not stretches:

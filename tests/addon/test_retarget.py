@@ -3,6 +3,7 @@
 import json
 import struct
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -68,6 +69,26 @@ def test_a_robot_to_try_it_on(blender: ModuleType) -> None:
     assert blender.ops.tricap.retarget() == {"FINISHED"} and robot.animation_data.action is not None
     assert not apply.read_target(robot).rig_map.missing_notes, "all of its bones are recognised"
     assert blender.ops.tricap.add_robot() == {"FINISHED"} and props.target.name == "Robot.001"
+
+
+@pytest.mark.parametrize(("origin_m", "lifted_m", "floor_m"), [(0.0, 0.0, 0.0), (0.0, -0.9, 0.0), (1.0, 1.0, 1.0), (1.9, 1.0, 1.0)])
+def test_the_floor_under_a_rig(origin_m: float, lifted_m: float, floor_m: float) -> None:
+    """It is at the origin or under the feet; a rig with its pelvis at the scene's origin comes to stand on the scene's floor."""
+    rig = person()
+    up = np.array([0.0, 0.0, lifted_m])
+    rig = replace(rig, head_m=rig.head_m + up, tail_m=rig.tail_m + up)
+    assert apply._floor_m(rig, find_map(rig, []), origin_m) == pytest.approx(floor_m, abs=0.03)
+
+
+def test_a_rig_with_its_pelvis_at_the_origin_stands_on_the_floor(blender: ModuleType) -> None:
+    source = squat(person())
+    rig = person(size=1.2)
+    up = np.array([0.0, 0.0, -rig.head_m[0, 2]])
+    target = build_armature(flail(replace(rig, head_m=rig.head_m + up, tail_m=rig.tail_m + up), frames=4, reach=0.1), "Pelvis")
+    onto(target, source)
+    motion = played(target, (0, 45, 89))
+    ankles_m = motion.head_m[:, [motion.rig.index[f"foot.{side}"] for side in "LR"], 2]
+    assert (ankles_m > 0).all() and ankles_m.max() < 0.2, ankles_m
 
 
 def played(target: Any, frames: Any) -> Any:

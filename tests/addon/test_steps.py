@@ -232,7 +232,7 @@ def test_where_the_fit_finds_nobody_the_panel_asks_for_clicks(
 def test_a_pulled_joint_is_fitted_again_in_its_frames(blender: ModuleType, done: Any, words: Words, why: Any, tmp_path: Path) -> None:
     """The shape, its skin at rest and the frames' other limbs stay; the keys of the scene's body move, the edited ones with their edits."""
     scene, out = done, tmp_path / "out"
-    with pytest.raises(RuntimeError, match="drag a joint first"):
+    with pytest.raises(RuntimeError, match="click or pull one first"):
         blender.ops.tricap.fit_again()
     body, kept = scene.objects["Body"], {name: (out / name).read_bytes() for name in ("body.toml", "skin/rest.npz", "trajectories.npz")}
     standing = importlib.import_module(f"{NAME}.scene.standing")

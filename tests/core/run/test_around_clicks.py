@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tricap.__main__ import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import read_rig
@@ -68,6 +69,23 @@ def test_images_with_other_times_need_no_whole_fit_and_other_images_do(sample: P
     image.write_bytes(content)
     os.utime(image, ns=(0, time + 5_000_000_000))
     assert fit_around_clicks(sample, out, {}, Monitor()) is None
+
+
+@pytest.mark.slow
+def test_the_command(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = sample / "results"
+    given = ["fit", str(sample), "--out", str(out), "--around-clicks"]
+    assert main(given) == 0
+    assert "were fitted again, with the shape as it was. `tricap scene` builds" in capsys.readouterr().out
+    assert main(given) == 2 and "No joints were clicked or pulled since" in capsys.readouterr().err
+    assert main([*given, "--set", "fitting.length_sigma=0.2"]) == 2 and "fit all frames, without" in capsys.readouterr().err
+
+
+def test_what_the_command_refuses(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["fit", str(sample), "--around-clicks", "--out"]
+    assert main([*given, str(sample / "other")]) == 2 and "There is no fitted body in" in capsys.readouterr().err
+    assert not (sample / "other").exists()
+    assert main([*given, str(sample / "results"), "--frames", "0:4"]) == 2 and "--frames is of a whole fit" in capsys.readouterr().err
 
 
 def test_a_body_that_is_not_ours_is_not_read(sample: Path) -> None:
