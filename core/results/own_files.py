@@ -8,7 +8,8 @@ from pathlib import Path
 from ..foundation import bounded
 
 NUMBERED = r"\d{4,}\.ply"  # a file for each frame
-PICTURES = r"(surface|cloud|tracks|body|outlines|patches|trails|vectors)_.+\.png|layers\.png"
+QUESTION = "question.png"  # in the report's folder: the poses between which a click decides
+PICTURES = r"(surface|cloud|tracks|body|outlines|patches|trails|vectors)_.+\.png|(layers|question)\.png"
 CACHE = "cache"
 MADE_IN = {  # names of files by folder
     "clouds": NUMBERED,

@@ -12,17 +12,19 @@ from ..body.model_file import read_model
 from ..body.motion import BodyFit
 from ..body.skin.mesh import SkinSettings
 from ..fitting.inputs.no_surface import empty_clouds
-from ..fitting.inputs.start_joints import NeedsClick
+from ..fitting.inputs.start_joints import NeedsClick, StartJoints
 from ..fitting.inputs.take_inputs import check_body
 from ..fitting.stages.set_up import NobodyFound
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
 from ..report.pages import check_pictured
+from ..report.pictures import png
+from ..report.question import question_picture
 from ..report.silhouettes import Silhouettes
 from ..results import blend_file, earlier_body, edited_tables, films
 from ..results.folder import MADE_BY, Results, check_separate_folder, lost
-from ..results.own_files import files_of
+from ..results.own_files import QUESTION, files_of
 from ..results.run_json import ASKS
 from ..surface.cloud import PointCloud
 from ..surface.frames import MeasuredFrames
@@ -162,20 +164,30 @@ class Run:
         self.notes += edited_tables.keep(self.results.folder, self.record["stages"])
         self.notes += earlier_body.keep(self.results.folder, _recorded(self.results), self.keys.get("fit", ""))
         self.results.remove(*names)
+        self.results.path("report", QUESTION).unlink(missing_ok=True)
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
         """A cancelled stage says what its checkpoints keep (`stopped`), and leaves no `partial` results; what the user is asked is noted in
-        run.json."""
+        run.json, with a picture."""
         try:
             yield
         except Cancelled as stop:
             self.results.remove(*partial)
             raise Cancelled(stopped()) from stop
         except (NeedsClick, NobodyFound) as question:
-            self.record[ASKS] = str(question)
+            asked = question if isinstance(question, NobodyFound) else self._with_picture(question.start)
+            self.record[ASKS] = str(asked)
             self.results.write_run(self.record)
-            raise
+            raise asked from question
+
+    def _with_picture(self, start: StartJoints) -> NeedsClick:
+        """The question about a start, with a picture of its pose and its likeliest rival."""
+        names, images = [view.name for view in self.footage.take.views], self.footage.read_whole(start.frame)
+        path = self.results.path("report", QUESTION)
+        path.parent.mkdir(exist_ok=True)
+        store.write_bytes(path, png(question_picture(start, self.footage.rig.cameras, names, images)))
+        return NeedsClick(start, f"{path} shows what was found there" + (" and the likeliest other pose." if start.rival_m else "."))
 
     def do_without_surface(self, why: str) -> None:
         """Note that there are no clouds and no trajectories."""

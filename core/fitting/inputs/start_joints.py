@@ -1,7 +1,7 @@
 """The joints at which a fit begins that was not clicked, and how sure they are."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class StartJoints:
     rivals: Mapping[str, float]
     ask: str  # the joint whose click would decide
     unsure: tuple[str, ...] = ()  # joints of arms that this frame does not show: the others decide where they are
+    rival_m: Mapping[str, np.ndarray] = field(default_factory=dict)  # (3,) by joint, of the likeliest other explanation, where there is one
 
     @staticmethod
     def sigma_m(joint: str) -> float:
@@ -33,9 +34,10 @@ class StartJoints:
     def question(self) -> str:
         """What is uncertain and which click decides, as sentences."""
         doubts = [name for name, _ in sorted(self.rivals.items(), key=lambda rival: -rival[1])]
+        doubt = f": {' or '.join(doubts[:2])}" if doubts else ""
         side = {"L": "left ", "R": "right "}.get(self.ask[-1], "") if "." in self.ask else ""
         return (
-            f"It is not certain how the person stands in frame {self.frame} ({self.probability:.0%}): {' or '.join(doubts[:2])}. "
+            f"It is not certain how the person stands in frame {self.frame} ({self.probability:.0%}){doubt}. "
             f"Click the {side}{self.ask.partition('.')[0]} in two views of frame {self.frame}, or three of neck, shoulders, pelvis and "
             "hips, which always suffice; then run it again. After one click it may ask for another."
         )
@@ -44,6 +46,6 @@ class StartJoints:
 class NeedsClick(InputError):
     """It is not certain how the person stands; the sentence asks for the click that decides: of this joint in this frame."""
 
-    def __init__(self, start: StartJoints) -> None:
-        super().__init__(start.question)
-        self.frame, self.joint = start.frame, start.ask
+    def __init__(self, start: StartJoints, note: str = "") -> None:
+        super().__init__(f"{start.question} {note}".rstrip())
+        self.start, self.frame, self.joint = start, start.frame, start.ask

@@ -29,7 +29,7 @@ from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
-from .limb_places import LimbPlaces, limb_places
+from .limb_places import NEAR_M, LimbPlaces, limb_places
 from .pose_dictionary import known_poses
 from .refine import (
     LEAST_POINTS,
@@ -143,14 +143,16 @@ def find_start(
     rivals = _named(explanations, kept * best.probability, names)
     if 1 - kept >= UNLIKELY:
         rivals[UNTRIED] = 1 - kept
+    likely = kept * float(best.probability[0])
     return StartJoints(
         frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
+        rival_m=_rival(names, final, explanations, kept * best.probability, _legs(limbs[at]), likely),
         stature=stature,
         model=fit.model.name,
         unsure=unsure,
-        probability=kept * float(best.probability[0]) * surely(legs),
-        rivals=_with_limbs(rivals, legs, kept * float(best.probability[0])),
+        probability=likely * surely(legs),
+        rivals=_with_limbs(rivals, legs, likely),
         ask=_least_sure(legs, max(1 - kept, 1 - float(best.probability[0])), {names[j] for j in joints.tolist()})
         or _decisive(explanations, np.maximum(best.probability, 1 - kept), names, joints),
     )
@@ -303,6 +305,25 @@ def _named(explanations: Sequence[Explanation], probability: np.ndarray, names: 
             name = _difference(best, other, names)
             named[name] = named.get(name, 0.0) + p
     return named
+
+
+def _rival(
+    names: Sequence[str],
+    final: Explanation,
+    explanations: Sequence[Explanation],
+    probability: np.ndarray,
+    legs: Sequence[LimbPlaces],
+    likely: float,
+) -> dict[str, np.ndarray]:
+    """The joints of the likeliest other explanation: one of the `explanations`, the best first, or the `final` one, which is as `likely`
+    as that, with a leg elsewhere; empty if none has a probability."""
+    found = [(p, dict(zip(names, one.joints_m))) for one, p in zip(explanations[1:], probability[1:].tolist())]
+    for leg in legs:
+        k = int(np.argmax(np.where(leg.off_m.max(axis=1) > NEAR_M, leg.probability, -1.0)))
+        joints = [leg.limb.parameters.skeleton.bones[bone].tail_joint for bone in leg.limb.bones.tolist()]
+        found.append((likely * (1 - leg.certainty), {**dict(zip(names, final.joints_m)), **dict(zip(joints, leg.ends_m[k]))}))
+    p, joints_m = max(found, key=lambda one: one[0], default=(0.0, dict[str, np.ndarray]()))
+    return joints_m if p >= UNLIKELY else {}
 
 
 def _difference(a: Explanation, b: Explanation, names: Sequence[str]) -> str:

@@ -35,4 +35,4 @@ def taken_back(
             more[name] += exchanged(fit, thin, found, joints, part, close=-np.inf).score - found.score
     if not more or max(more.values()) < MORE:
         return None
-    return replace(start, probability=UNLIKELY, rivals={max(more, key=lambda name: more[name]): 1 - UNLIKELY})
+    return replace(start, probability=UNLIKELY, rivals={max(more, key=lambda name: more[name]): 1 - UNLIKELY}, rival_m={})

@@ -1,6 +1,7 @@
 """`tricap check` of rigs and of results: every fault is made and must be named; the demo's rig and a finished run pass."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,11 +16,13 @@ from tricap.core.checking.rig_check import check_rig, wide_findings
 from tricap.core.checking.run_check import check_run
 from tricap.core.checking.take_check import check_clouds, check_first_frame
 from tricap.core.cli import main
+from tricap.core.fitting.inputs.start_joints import NeedsClick, StartJoints
 from tricap.core.fitting.stages.set_up import NobodyFound
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.view_angles import no_view_alike
+from tricap.core.images.picture import decoded
 from tricap.core.motion.formats.ply import read_ply, write_cloud
 from tricap.core.motion.tables import read_joints
 from tricap.core.run import pipeline
@@ -270,6 +273,20 @@ def test_a_run_that_came_to_no_end_is_named(plane_take: Path, tmp_path: Path, mo
     assert unfinished() == []
     (out / ".tricap-lock").write_text('{"pid": 1}')
     assert unfinished() == [f"A run in {out} was killed before its end, or is still at work (.tricap-lock)."]
+
+
+def test_a_question_about_the_start_comes_with_a_picture(plane_take: Path, tmp_path: Path) -> None:
+    """It is gone when the next fit begins."""
+    out, joints = tmp_path / "out", {"elbow.R": np.array([0.0, 0.0, 1.5]), "wrist.R": np.array([0.1, 0.0, 1.5])}
+    start = StartJoints(frame=1, xyz_m=joints, stature=1.0, model="arm.R", probability=0.6, rivals={"front and back": 0.4}, ask="wrist.R")
+    picture = out / "report" / "question.png"
+    with open_run(plane_take, out, {}, (0, 2)) as job:
+        with pytest.raises(NeedsClick, match=f"Click the right wrist.*{re.escape(str(picture))} shows what was found there.$") as asked:
+            with job.resumable(stopped=str):
+                raise NeedsClick(start)
+        assert job.results.read_run()["asks"] == str(asked.value) and decoded(picture).shape[2] == 3
+        job.remove_body(())
+        assert not picture.exists()
 
 
 def test_the_points_of_a_trunk_lie_on_its_flesh(tmp_path: Path) -> None:
