@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -80,11 +80,14 @@ def can_be_read(results: Results) -> bool:
     return True
 
 
+PLACES = ("xyz_m", "rival_m")  # tables of joints
+
+
 def _start_table(start: StartJoints) -> dict[str, Any]:
     table = {f.name: getattr(start, f.name) for f in fields(StartJoints)}
-    return table | {"xyz_m": {name: xyz.tolist() for name, xyz in start.xyz_m.items()}}
+    return table | {name: {joint: xyz.tolist() for joint, xyz in table[name].items()} for name in PLACES}
 
 
 def _start(table: Mapping[str, Any]) -> StartJoints:
-    start = StartJoints(**table)
-    return replace(start, xyz_m={name: np.array(xyz) for name, xyz in table["xyz_m"].items()}, unsure=tuple(table["unsure"]))
+    places = {name: {joint: np.array(xyz) for joint, xyz in table.get(name, {}).items()} for name in PLACES}
+    return StartJoints(**{**table, **places, "unsure": tuple(table["unsure"])})

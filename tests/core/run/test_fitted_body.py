@@ -71,14 +71,15 @@ def test_everything_that_was_fitted_is_read_back(take: Path, tmp_path: Path) -> 
     assert body is not None
     start = StartJoints(
         frame=2, xyz_m={"neck": np.array([0.1, 1 / 3, 2.0])}, stature=1.02, model="full", probability=0.97, rivals={"turned": 0.03},
-        ask="elbow.R", unsure=("wrist.R",),
+        ask="elbow.R", unsure=("wrist.R",), rival_m={"neck": np.array([0.2, 1 / 3, 2.0])},
     )  # fmt: skip
     write_fitted(Results(tmp_path), "k", FittedBody(body=body, model="full", start=start))
     found = read_fitted(Results(tmp_path), "k")
     assert found is not None and found.start is not None and found.model == "full" and read_fitted(Results(tmp_path), "other") is None
     assert np.array_equal(found.start.xyz_m["neck"], start.xyz_m["neck"])
+    assert np.array_equal(found.start.rival_m["neck"], start.rival_m["neck"])
     for f in fields(StartJoints):
-        assert f.name == "xyz_m" or _same(found.start, start, f.name), f.name
+        assert f.name in ("xyz_m", "rival_m") or _same(found.start, start, f.name), f.name
     for f in fields(BodyFit):
         if f.name not in ("shape", "motion"):
             assert _same(found.body, body, f.name), f.name
