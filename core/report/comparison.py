@@ -19,9 +19,9 @@ EQUAL = 0.02  # relative difference below which neither method is better
 KINDS = {  # of pictures, and their captions
     "patches": "least squares matching of one point, at the start (black) and as found (white)",
     "surface": "measured points, coloured by their sigma",
-    "cloud": "the cloud from the front and from the right side",
+    "cloud": "the cloud from the reference camera and from its right side",
     "tracks": "the paths of the points over the last frames, coloured by speed",
-    "trails": "trajectories from the front and from the right side",
+    "trails": "trajectories from the reference camera and from its right side",
     "vectors": "vectors of the tracked points, from the front and from the right side",
     "body": "the fitted body",
     "layers": "the layers of the body in its rest pose",

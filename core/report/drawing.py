@@ -16,7 +16,7 @@ OF_PANELS = 1.7  # size of letters in pictures of two panels, which are shown sm
 STRIP_PX, TITLE_PX, ROW_PX = 54, 20, 18  # heights of the strip under a picture, of a title and of a row of a legend, by the size of letters
 ROOM_PX = 300  # width that the strip's content needs, by the size of letters
 GROUND = (28, 28, 28)
-FRONT, SIDE = "from the front", "from the right side"  # names of panels
+FRONT, SIDE = "from the reference camera", "from its right side"  # names of panels
 LONGEST = 0.3  # of the picture's width, that a scale takes at most
 RAMP = cv2.applyColorMap(np.linspace(25, 245, 256).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0]  # blue to red, BGR
 

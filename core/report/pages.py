@@ -175,7 +175,7 @@ def _pictures(
             pictures.with_scale(over, part.camera, cloud.xyz_m, (high, "sigma, mm") if len(sigma) else None),
         )
         from_sides = pictures.cloud_views(cloud, camera, spacing)
-        found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the front and from its right side", from_sides)
+        found[f"cloud_{frame:04d}.png"] = (f"Frame {frame}: the cloud from the reference camera and from its right side", from_sides)
         if trajectories is not None and trajectories.visible.any():
             caption = f"Frame {frame}, view {view}: the paths of the points over the last {pictures.TAIL_FRAMES} frames, coloured by speed"
             name = f"tracks_{frame:04d}.png"

@@ -46,7 +46,7 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
         colours[reason == value] = colour
     grey, green = (np.broadcast_to(np.array(c), colours.shape) for c in (ALL_COLOUR, KEPT_COLOUR))
     some = f", one trajectory in {every}" if every > 1 else ""
-    both = f"from the front and from the right side{some}"
+    both = f"{FRONT} and {SIDE}{some}"
     wanted = (
         (f"All {int(seen.sum()):,} tracked positions before the filters, {both}", seen, grey, [(ALL_COLOUR, "tracked")]),
         (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", removed, colours, MEANINGS),
@@ -86,7 +86,7 @@ def vector_pictures(
         arrows = own[rows] * (ARROW * limits[1] / high * np.minimum(1.0, MOST_LONG * high / np.maximum(size, 1e-12)))[:, None]
         pair = [_arrows(place[rows], arrows, size / high, limits, axes) for axes in ("xy", "zy")]
         some = f", one point in {every}" if every > 1 else ""
-        words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, from the front and from the right side{some}"
+        words = f"Frame {trajectories.frames[index]}: {name} of {len(rows):,} tracked points, {FRONT} and {SIDE}{some}"
         shown = framed(pair, limits[1], (high, f"{name}, {unit.replace('²', '^2')}"))
         found[key] = (f"{words}; red and longest: {high:.2g} {unit} or more", shown)
     return found

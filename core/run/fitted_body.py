@@ -17,6 +17,7 @@ from ..results.folder import Results
 
 STAGE, NAME = "body", "fitted"
 OF_SHAPE = ("dof_names", "joint_names")  # of the motion: they follow from the skeleton
+PLACES = ("xyz_m", "rival_m")  # of a start: places by joint
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,9 +79,6 @@ def can_be_read(results: Results) -> bool:
     except InputError:
         return False
     return True
-
-
-PLACES = ("xyz_m", "rival_m")  # tables of joints
 
 
 def _start_table(start: StartJoints) -> dict[str, Any]:

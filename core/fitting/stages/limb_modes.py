@@ -120,7 +120,7 @@ def of_joints(limbs: Sequence[Elsewhere], skeleton: Skeleton, frames: int) -> np
     for one in limbs:
         for b in one.limb.outer.tolist():
             end = np.flatnonzero(one.limb.bones == b)
-            variance[:, skeleton.joint_names.index(skeleton.bones[b].tail_joint)] = one.variance_m2[:, end[0] if len(end) else -1]
+            variance[:, skeleton.joint_names.index(skeleton.bones[b].tail_joint)] += one.variance_m2[:, end[0] if len(end) else -1]
     return variance
 
 

@@ -31,7 +31,7 @@ def turn_hands(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> np.
     Raises:
         Cancelled: the user asked to stop.
     """
-    motion, hands = motion.copy(), _hands(given.fit)
+    motion, hands = motion.copy(), hands_looked_for(given.fit)
     for i, limb in enumerate(hands):
         way = best_way(given, motion, limb, [*range(len(motion))], True, monitor.part(STAGE, i, len(hands)))
         for t, angles in _better(given, motion, limb, way).items():
@@ -51,7 +51,7 @@ def _better(given: PoseTracking, motion: np.ndarray, limb: Limb, way: Way) -> di
 
 def angles_of_hands(fit: FitContext, motion: np.ndarray) -> np.ndarray | None:
     """The angles (T, D) of the hands in a motion (T, D) in which they were turned, NaN of other DOFs; None where none were."""
-    columns = [c for limb in _hands(fit) for c in limb.columns.tolist()]
+    columns = [c for limb in hands_looked_for(fit) for c in limb.columns.tolist()]
     if not columns:
         return None
     found = np.full(motion.shape, np.nan)
@@ -70,7 +70,7 @@ def priors_at(fit: FitContext, t: int) -> list[Observation]:
     ]
 
 
-def _hands(fit: FitContext) -> list[Limb]:
+def hands_looked_for(fit: FitContext) -> list[Limb]:
     """The hands that are looked for: not where outlines of views all around are all that shows them."""
     if not fit.background.known or not fit.settings.search_limbs or fit.in_views is not None:
         return []
