@@ -3,8 +3,8 @@
 Where few measured points are a hand's own, because it lies on the body or behind it, the adjustment turns it to points of something
 else, and its normal equations call that certain. What the hand explains with its fingers and no other part of the body does (the first sums
 of (3) in `explained`) tells: hands that are fitted right explain 20 to 90 voxels, those behind the body less than 10. Where the running
-median over `WINDOW_S` is below `SHOWN`, s is 1, else 0; its mean s̄ over `BLEND_S` draws the angles θ of the hand's own joint to their prior
-mean μ and adds the prior's variance:
+median over `WINDOW_S` is below `SHOWN` for `LEAST_S` or more, s is 1, else 0; its mean s̄ over `BLEND_S` draws the angles θ of the hand's
+own joint to their prior mean μ and adds the prior's variance:
 
     θ' = (1 − s̄) θ + s̄ μ ,   K' = K + s̄ σ²                                                               (1)
 
@@ -27,6 +27,7 @@ from .turned_hands import hands_looked_for
 
 SHOWN = 15.0  # voxels
 WINDOW_S, BLEND_S = 0.2, 0.1  # before and after a frame
+LEAST_S = 0.4  # that a hand hangs: for less it is not drawn to rest and back
 EQUAL_S = 1e-3  # differences of times
 
 
@@ -75,4 +76,7 @@ def _unseen(fit: FitContext, hand: Limb, points: Sequence[CloudPoints], at: Esti
     around = np.abs(time_s[:, None] - time_s)
     unseen = np.array([np.median(own[row <= WINDOW_S + EQUAL_S]) < SHOWN for row in around], dtype=float)
     unseen[(around[:, clicked] <= WINDOW_S + EQUAL_S).any(axis=1)] = 0.0
+    for run in np.split(np.arange(len(unseen)), np.flatnonzero(np.diff(unseen)) + 1):
+        if unseen[run[0]] and len(run) < len(unseen) and time_s[run[-1]] - time_s[run[0]] < LEAST_S - EQUAL_S:
+            unseen[run] = 0.0  # between frames, or beside them, that show it
     return np.array([unseen[row <= BLEND_S + EQUAL_S].mean() for row in around])

@@ -153,7 +153,7 @@ def test_a_hand_that_is_seen_keeps_its_pose_and_one_that_is_not_hangs(tracking, 
 
 
 def test_a_hand_is_drawn_to_rest_over_some_frames_and_stays_where_it_is_clicked(tracking, monkeypatch: pytest.MonkeyPatch) -> None:
-    T, fit = 30, tracking.fit
+    T, fit = 50, tracking.fit
     points, own = [tracking.points[0]] * T, np.where(np.arange(T) < 15, 80.0, 5.0)
     own[[4, 22]] = 5.0, 80.0  # single frames decide nothing
     explained = iter(own.tolist())
@@ -164,11 +164,16 @@ def test_a_hand_is_drawn_to_rest_over_some_frames_and_stays_where_it_is_clicked(
     motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked={}), T)
     share = 1 - found[:, ANGLES[1]] / motion[:, ANGLES[1]]
     assert np.allclose(share[:11], 0) and np.allclose(share[20:], 1) and np.diff(share).max() < 0.2 and np.diff(share).min() > -1e-9
+    own[:3] = own[22:] = 80.0  # for a moment in the middle it does not show
+    explained = iter(own.tolist())
+    motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked={}), T)
+    assert np.array_equal(found, motion)
+    own[15:] = 5.0
     explained = iter(own.tolist())
     knuckles = SHAPE.skeleton.joint_names.index("knuckles.R")
-    clicked = {25: replace(fit.clicked[0], joint=np.full_like(fit.clicked[0].joint, knuckles))}
+    clicked = {40: replace(fit.clicked[0], joint=np.full_like(fit.clicked[0].joint, knuckles))}
     motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked=clicked), T)
-    assert np.array_equal(found[22:29], motion[22:29]) and not np.array_equal(found[17], motion[17])
+    assert np.array_equal(found[37:44], motion[37:44]) and not np.array_equal(found[20], motion[20])
 
 
 def limb_columns(tracking: PoseTracking) -> np.ndarray:
