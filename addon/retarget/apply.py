@@ -84,9 +84,8 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
 
 
 def _floor_m(rig: Rig, rig_map: RigMap, origin_m: float) -> float:
-    """The height of the floor under a rig as it stands, whose origin is at this height: that of the origin, where the feet are, or else
-    their own. A rig whose origin is in its pelvis and at
-    height 0 was not put on its feet: it is to stand on the scene's floor."""
+    """The height of the floor under a rig as it stands, whose origin is at this height: that of the origin, if the feet are there, or else
+    that of the feet. A rig that has its pelvis at the scene's origin was not put on its feet: it is to stand on the scene's floor."""
     if stood_up(rig, rig_map) is not rig:
         return 0.0
     low, near = lowest_m(rig), FLOOR_AT_ORIGIN * rig.height_m

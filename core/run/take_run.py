@@ -164,7 +164,9 @@ class Run:
         self.notes += edited_tables.keep(self.results.folder, self.record["stages"])
         self.notes += earlier_body.keep(self.results.folder, _recorded(self.results), self.keys.get("fit", ""))
         self.results.remove(*names)
-        self.results.path("report", QUESTION).unlink(missing_ok=True)
+        for path in files_of(self.results.path("report"), "report"):
+            if path.name == QUESTION:
+                path.unlink()
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:

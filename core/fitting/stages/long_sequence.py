@@ -28,7 +28,7 @@ from .contradicted import misplaced_limbs, widened
 from .joint_places import JointPlaces, has_both_sides, joints_in_place, place_sigmas
 from .limb_modes import elsewhere, of_joints
 from .pose_tracking import Checkpoints
-from .unseen_hands import with_unseen_hands
+from .unseen_hands import unseen_hands
 
 A = TypeVar("A")
 DIRECTIONS = {1: "ahead", -1: "back"}
@@ -116,8 +116,8 @@ def frame_results(
     sigma0 = np.array([frame_sigma0(fit, t, points[t], solution) for t in frames])
     counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
     limbs = whole_limbs(fit.parameters) if limbs is None else limbs
-    solution, hands = with_unseen_hands(fit, points, solution, part.time_s, frames, limbs)
-    wrong, others = [], [*elsewhere(fit, points, solution, part.time_s, frames, limbs), *hands]
+    given = fit, points, solution, part.time_s, frames, limbs
+    wrong, others = [], [*elsewhere(*given), *unseen_hands(*given)]
     for i, t in enumerate(frames):
         fit.monitor.check()
         state = fit.parameters.state(solution.motion[t], solution.vector)

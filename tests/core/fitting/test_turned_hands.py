@@ -22,10 +22,10 @@ from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Estimate, Scales
 from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages import turned_hands, unseen_hands
+from tricap.core.fitting.stages.limb_modes import Elsewhere
 from tricap.core.fitting.stages.pose_tracking import PoseTracking
 from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.fitting.stages.turned_hands import angles_of_hands, priors_at, turn_hands
-from tricap.core.fitting.stages.unseen_hands import with_unseen_hands
 from tricap.core.foundation.progress import Monitor
 
 from .limb_scene import front_rig, hand_places, measured_cloud, person_seen, points_on_hand
@@ -127,53 +127,47 @@ def test_a_little_more_is_no_reason(tracking, monkeypatch: pytest.MonkeyPatch) -
     assert turned_hands._better(tracking, over, limb, way).keys() == {1, 2, 3, 4}
 
 
-def _with_unseen(tracking: PoseTracking, points: list[CloudPoints], fit=None, frames: int = FRAMES):
-    motion = np.tile(_pose(TRUE), (frames, 1))
-    fit = fit or tracking.fit
+def _added(tracking: PoseTracking, clicked, frames: int = FRAMES) -> Elsewhere:
+    """What the right hand adds to the covariance of all frames but the first."""
+    fit = replace(tracking.fit, clicked=clicked)
     arms = [limb for limb in whole_limbs(fit.parameters) if HAND in limb.outer]
-    given = Estimate(motion=motion, vector=tracking.first.vector)
-    found, added = with_unseen_hands(fit, points, given, np.arange(frames) / 30, range(1, frames), arms)
-    assert np.array_equal(given.motion, motion), "what is given stays as it is"
-    return motion, found.motion, added
+    given = Estimate(motion=np.tile(_pose(TRUE), (frames, 1)), vector=tracking.first.vector)
+    (found,) = unseen_hands.unseen_hands(fit, tracking.points[:1] * frames, given, np.arange(frames) / 30, range(1, frames), arms)
+    return found
 
 
-def test_a_hand_that_is_seen_keeps_its_pose_and_one_that_is_not_hangs(tracking, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the wrist: the forearm's twist is the arm's. Joints of unseen hands are uncertain by some centimetres."""
-    motion, found, (hand,) = _with_unseen(tracking, tracking.points, replace(tracking.fit, clicked={}))
-    assert np.array_equal(found, motion) and not hand.covariance.any() and not hand.variance_m2.any()
+def test_a_hand_that_is_not_seen_is_uncertain_by_centimetres(tracking, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its wrist, that is: the forearm's twist is the arm's."""
+    seen = _added(tracking, {})
+    assert not seen.covariance.any() and not seen.variance_m2.any()
     nothing = Evidence.of(tracking.points[0].take(np.zeros(0, dtype=np.intp)), [], tracking.fit.settings.voxel_m)
     monkeypatch.setattr(type(tracking.fit), "seen", lambda *_: nothing)
-    motion, found, (hand,) = _with_unseen(tracking, tracking.points, replace(tracking.fit, clicked={}))
-    wrist, twist = ANGLES[1:], ANGLES[0]
-    assert np.abs(found[:, wrist]).max() < 1e-12 and np.array_equal(np.delete(found, wrist, 1), np.delete(motion, wrist, 1))
-    sigma_m = np.sqrt(hand.variance_m2)
-    assert hand.covariance.shape[0] == FRAMES - 1 and 0.04 < sigma_m.min() and sigma_m.max() < 0.1
+    hand = _added(tracking, {})
+    sigma_m, variance = np.sqrt(hand.variance_m2), np.diag(hand.covariance[0])
+    ends = hand.limb.ends(_pose(TRUE)[None], tracking.first.vector)[0]
+    assert hand.covariance.shape[0] == FRAMES - 1 and sigma_m.shape == (FRAMES - 1, len(ends))
+    assert 0.04 < sigma_m.min() and sigma_m.max() < 0.1
     own = hand.limb.columns.tolist()
-    assert hand.covariance[0, own.index(twist), own.index(twist)] == 0 and np.diag(hand.covariance[0])[own.index(wrist[0])] > 0.5
+    assert variance[own.index(ANGLES[0])] == 0 and np.allclose(variance[[own.index(a) for a in ANGLES[1:]]], np.radians([60, 20]) ** 2)
 
 
-def test_a_hand_is_drawn_to_rest_over_some_frames_and_stays_where_it_is_clicked(tracking, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_frames_do_not_decide_whether_a_hand_is_seen_and_clicks_do(tracking, monkeypatch: pytest.MonkeyPatch) -> None:
     T, fit = 50, tracking.fit
-    points, own = [tracking.points[0]] * T, np.where(np.arange(T) < 15, 80.0, 5.0)
-    own[[4, 22]] = 5.0, 80.0  # single frames decide nothing
-    explained = iter(own.tolist())
-    monkeypatch.setattr(unseen_hands, "limb_gains", lambda *_: np.array([next(explained)]))
+    own = np.where(np.arange(T) < 15, 80.0, 5.0)
+    own[[4, 22]] = 5.0, 80.0
     monkeypatch.setattr(unseen_hands, "misplaced", lambda *_: 0.0)
-    seen = SimpleNamespace(near=lambda *_: None)
-    monkeypatch.setattr(type(fit), "seen", lambda *_: seen)
-    motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked={}), T)
-    share = 1 - found[:, ANGLES[1]] / motion[:, ANGLES[1]]
-    assert np.allclose(share[:11], 0) and np.allclose(share[20:], 1) and np.diff(share).max() < 0.2 and np.diff(share).min() > -1e-9
-    own[:3] = own[22:] = 80.0  # for a moment in the middle it does not show
-    explained = iter(own.tolist())
-    motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked={}), T)
-    assert np.array_equal(found, motion)
-    own[15:] = 5.0
-    explained = iter(own.tolist())
-    knuckles = SHAPE.skeleton.joint_names.index("knuckles.R")
-    clicked = {40: replace(fit.clicked[0], joint=np.full_like(fit.clicked[0].joint, knuckles))}
-    motion, found, _ = _with_unseen(tracking, points, replace(fit, clicked=clicked), T)
-    assert np.array_equal(found[37:44], motion[37:44]) and not np.array_equal(found[20], motion[20])
+    monkeypatch.setattr(type(fit), "seen", lambda *_: SimpleNamespace(near=lambda *_: None))
+
+    def share(clicked) -> np.ndarray:
+        explained = iter(own.tolist())
+        monkeypatch.setattr(unseen_hands, "limb_gains", lambda *_: np.array([next(explained)]))
+        return _added(tracking, clicked, T).variance_m2[:, 0]
+
+    found = share({}) / share({}).max()
+    assert not found[:10].any() and np.allclose(found[19:], 1) and 0 <= np.diff(found).min() and np.diff(found).max() < 0.2
+    knuckles = np.full_like(fit.clicked[0].joint, SHAPE.skeleton.joint_names.index("knuckles.R"))
+    clicked = share({40: replace(fit.clicked[0], joint=knuckles)})
+    assert not clicked[36:43].any() and clicked[25] > 0 and clicked[48] > 0
 
 
 def limb_columns(tracking: PoseTracking) -> np.ndarray:
