@@ -5,13 +5,14 @@ The footage is undistorted with the calibrated lens, so that it fits the ideal c
 
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import bpy
 import cv2
 import numpy as np
 
+from ...core.cli.streams import unheard
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera, image_of, interior_of
@@ -85,7 +86,8 @@ def rendered(scene: bpy.types.Scene) -> np.ndarray:
         scene.render.filepath = str(Path(folder) / "picture.png")
         scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
         try:
-            bpy.ops.render.render(write_still=True)
+            with unheard() if bpy.app.background else nullcontext():  # graphics drivers print errors that do not matter
+                bpy.ops.render.render(write_still=True)
         finally:
             scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode = earlier
         return decoded(Path(folder) / "picture.png").astype(np.float64)

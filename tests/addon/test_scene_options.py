@@ -421,15 +421,17 @@ def test_a_movie_is_not_written_to_the_end_of_a_link(empty: ModuleType, tmp_path
 
 
 @pytest.mark.slow
-def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     from tricap.addon.scene import build, contents, movies, preview
     from tricap.core.foundation.progress import Monitor
 
     results = contents.read_contents(small_run.out, Monitor())
     build.write_scene(results)
     before = empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras)
+    capfd.readouterr()
     preview.preview(results, tmp_path / "p.png")
     movies.turntable(tmp_path / "t.mp4")
+    assert "".join(capfd.readouterr()).strip() == "", "Blender and the graphics driver are not heard"
     assert before == (empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras))
     picture = cv2.imread(str(tmp_path / "p.png"))
     alone, over = np.split(picture.astype(float), 2, axis=1)
