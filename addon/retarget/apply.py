@@ -85,11 +85,12 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
 
 def _floor_m(rig: Rig, rig_map: RigMap, origin_m: float) -> float:
     """The height of the floor under a rig as it stands, whose origin is at this height: that of the origin, if the feet are there, or else
-    that of the feet. A rig that has its pelvis at the scene's origin was not put on its feet: it is to stand on the scene's floor."""
+    that of the feet. A rig that has the scene's origin within its body was not put on its feet: it is to stand on the scene's floor."""
     if stood_up(rig, rig_map) is not rig:
         return 0.0
     low, near = lowest_m(rig), FLOOR_AT_ORIGIN * rig.height_m
-    return origin_m if min(abs(low - origin_m), abs(origin_m)) < near else low
+    within = abs(origin_m) < near and low < origin_m < low + rig.height_m
+    return origin_m if within or abs(low - origin_m) < near else low
 
 
 def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:

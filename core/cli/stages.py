@@ -66,13 +66,14 @@ def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _fit_around_clicks(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    refuse_unused({"--frames": args.frames is not None, "--restart": args.restart}, "is of a whole fit; leave out --around-clicks")
+    refuse_unused({"--restart": args.restart}, "is of a whole fit, and --around-clicks keeps one")
     if not (args.out / "body.toml").is_file():
         raise InputError(f"There is no fitted body in {args.out}; fit all frames first, without --around-clicks.")
-    found = fit_around_clicks(args.take, args.out, overrides(args.set), monitor)
+    found = fit_around_clicks(args.take, args.out, overrides(args.set), monitor, frame_range(args.frames))
     if found is None:
         raise InputError(
-            "More than the clicks of fitted frames has changed since the body was fitted; fit all frames, without --around-clicks."
+            "More than the clicks of fitted frames has changed since the body was fitted (or it was with other --frames or --set); fit all "
+            "frames, without --around-clicks."
         )
     if args.json:
         return [json.dumps(Results(args.out).read_run(), indent=1, ensure_ascii=False)]

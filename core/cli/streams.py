@@ -63,19 +63,24 @@ def robust() -> Iterator[None]:
 def unheard() -> Iterator[None]:
     """What libraries print goes nowhere: what matters is said afterwards, and a stream that is full or closed would end them."""
     numbers = [number for number in (1, 2) if _is_open(number)]
+    _flush()
     kept, nowhere = [os.dup(number) for number in numbers], os.open(os.devnull, os.O_WRONLY)
     try:
         for number in numbers:
             os.dup2(nowhere, number)
         yield
     finally:
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError):
-                stream.flush()
+        _flush()
         for number, before in zip(numbers, kept):
             os.dup2(before, number)
             os.close(before)
         os.close(nowhere)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
 
 
 def _is_open(number: int) -> bool:

@@ -175,6 +175,12 @@ def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarra
     return _explained_by(evidence, body, state, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
 
 
+def explained(evidence: Evidence, limb: Limb, state: BodyState, width_m: float) -> float:
+    """The area that a body's limb explains: (3) without its last sum."""
+    capsules, fingers = _limb_capsules(limb, state.motion[None], state)
+    return float(_explained_by(evidence, capsules, state, width_m, UNSEEN, fingers=fingers)[0])
+
+
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
     """The area of a body's limb that contradicts what is seen: the last sum of (3)."""
     return float(_misplaced(evidence, _limb_capsules(limb, state.motion[None], state)[0], state, _others(limb, state))[0])

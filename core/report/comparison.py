@@ -22,7 +22,7 @@ KINDS = {  # of pictures, and their captions
     "cloud": "the cloud from the reference camera and from its right side",
     "tracks": "the paths of the points over the last frames, coloured by speed",
     "trails": "trajectories from the reference camera and from its right side",
-    "vectors": "vectors of the tracked points, from the front and from the right side",
+    "vectors": "vectors of the tracked points, from the reference camera and from its right side",
     "body": "the fitted body",
     "layers": "the layers of the body in its rest pose",
 }

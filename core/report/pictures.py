@@ -1,4 +1,4 @@
-"""Pictures of a run: the fitted body over the footage, trajectories over the footage, the cloud from the front and from the side."""
+"""Pictures of a run: the fitted body over the footage, trajectories over the footage, the cloud from the reference camera and its side."""
 
 import cv2
 import numpy as np
@@ -78,7 +78,7 @@ def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajecto
 
 
 def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarray:
-    """The cloud as a shaded body from the front (along the reference camera) and from its right side, in one picture."""
+    """The cloud as a shaded body from the reference camera and from its right side, in one picture."""
     p = camera.to_camera(cloud.xyz_m)
     n = cloud.normals @ camera.R_cam_world.T
     if not len(p):

@@ -1,5 +1,5 @@
-"""Trajectories before and after the filters, from the front and from the side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all that were
-tracked, what was removed, by reason, and what was kept."""
+"""Trajectories before and after the filters, from the reference camera and from its side (D'Apuzzo & Plänkers 2000, Figs. 11–13): all
+that were tracked, what was removed, by reason, and what was kept."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -72,7 +72,7 @@ def longest_vectors(trajectories: Trajectories, index: int) -> dict[str, float]:
 def vector_pictures(
     trajectories: Trajectories, camera: Camera, index: int, longest: Mapping[str, float]
 ) -> dict[str, tuple[str, np.ndarray]]:
-    """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the front and from the side
+    """Captions and pictures of the velocities and of the accelerations in one frame, as arrows from the reference camera and from its side
     (D'Apuzzo et al. 1999, Fig. 9), by the name in `VECTORS`; of those that are in `longest`, the size of the longest and red arrows."""
     found, place = dict[str, tuple[str, np.ndarray]](), camera.to_camera(trajectories.xyz_m[index].astype(np.float64))
     for key, (name, unit, vectors) in _vectors(trajectories, index).items():

@@ -46,6 +46,7 @@ from .file_digests import FileDigests
 from .record import FrameTable, read_frame_table, write_frame_table
 from .settings import Overrides, settings_of
 from .stages import CONTENT, Stamp, followed_clicks, stage_keys
+from .take_run import only_frames
 
 FITTED_WITH = "fitted_with"  # entry of the fit in run.json: what the body was fitted with, see `fitted_with`
 MOST_CLOUDS = 64  # in memory: those of the background, and of one stretch
@@ -96,9 +97,11 @@ def frames_again(fit: Mapping[str, Any], footage: Footage, settings: Mapping[str
     return ", ".join(f"{first}–{last}" if first != last else f"{first}" for first, last in fit[AGAIN])
 
 
-def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monitor: Monitor) -> FittedAgain | None:
+def fit_around_clicks(
+    take_folder: Path, out: Path, overrides: Overrides, monitor: Monitor, frames: tuple[int, int] | None = None
+) -> FittedAgain | None:
     """Fit the frames around new, moved and removed joint clicks again. None where more than clicks has changed since
-    the body was fitted, so that a whole fit is needed.
+    the body was fitted, so that a whole fit is needed. `frames`: those of that fit, half-open, where they were not all.
 
     Raises:
         InputError: no clicks have changed, they contradict each other, or the results are damaged.
@@ -107,6 +110,7 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
     take = read_take(take_folder)
     settings = settings_of(take.settings, overrides, str(take.folder / "take.toml"))
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
+    footage = footage if frames is None else only_frames(footage, frames)
     check_body(footage, settings["fitting"])
     with Results(out).opened() as results:
         record = results.read_run()
@@ -130,17 +134,17 @@ def fit_around_clicks(take_folder: Path, out: Path, overrides: Overrides, monito
             parts.append(_fitted(footage, results, settings, body, rows, joints, monitor.part("fit", i, len(stretches))))
         edited = edited_tables.edited(results.folder, record["stages"])  # their edits stay in them
         _write(results, settings["skin"], body, parts)
-        again = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
-        record["stages"]["fit"] |= {FITTED_WITH: {**before, **now}, AGAIN: again}
+        ends = [[int(part.frames[0]), int(part.frames[-1])] for part in parts]
+        record["stages"]["fit"] |= {FITTED_WITH: {**before, **now}, AGAIN: ends}
         if noted := record["stages"]["fit"].get(edited_tables.ENTRY):
             noted |= {name: digest for name, digest in edited_tables.digests(results.folder).items() if name not in edited}
         results.write_run(record)
         written = _Body.read(results, body.model)
-    frames = np.concatenate([part.frames for part in parts])
-    fitted = np.isin(body.motion.frames, frames)
+    again = np.concatenate([part.frames for part in parts])
+    fitted = np.isin(body.motion.frames, again)
     return FittedAgain(
         shape=body.shape,
-        frames=frames,
+        frames=again,
         dof_names=body.motion.dof_names,
         before=body.motion.values[fitted],
         after=np.concatenate([part.values for part in parts]),

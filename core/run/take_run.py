@@ -163,10 +163,7 @@ class Run:
         """Remove the body's files: a finished body becomes the earlier one, and what was edited is copied to another name."""
         self.notes += edited_tables.keep(self.results.folder, self.record["stages"])
         self.notes += earlier_body.keep(self.results.folder, _recorded(self.results), self.keys.get("fit", ""))
-        self.results.remove(*names)
-        for path in files_of(self.results.path("report"), "report"):
-            if path.name == QUESTION:
-                path.unlink()
+        self.results.remove(*names, f"report/{QUESTION}")
 
     @contextmanager
     def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
@@ -177,19 +174,27 @@ class Run:
         except Cancelled as stop:
             self.results.remove(*partial)
             raise Cancelled(stopped()) from stop
-        except (NeedsClick, NobodyFound) as question:
-            asked = question if isinstance(question, NobodyFound) else self._with_picture(question.start)
-            self.record[ASKS] = str(asked)
-            self.results.write_run(self.record)
-            raise asked from question
+        except NeedsClick as question:
+            with_picture = NeedsClick(question.start, self._question_shown(question.start))
+            self._note_question(with_picture)
+            raise with_picture from question
+        except NobodyFound as question:
+            self._note_question(question)
+            raise
 
-    def _with_picture(self, start: StartJoints) -> NeedsClick:
-        """The question about a start, with a picture of its pose and its likeliest rival."""
-        names, images = [view.name for view in self.footage.take.views], self.footage.read_whole(start.frame)
-        path = self.results.path("report", QUESTION)
-        path.parent.mkdir(exist_ok=True)
-        store.write_bytes(path, png(question_picture(start, self.footage.rig.cameras, names, images)))
-        return NeedsClick(start, f"{path} shows what was found there" + (" and the likeliest other pose." if start.rival_m else "."))
+    def _note_question(self, question: InputError) -> None:
+        self.record[ASKS] = str(question)
+        self.results.write_run(self.record)
+
+    def _question_shown(self, start: StartJoints) -> str:
+        """Draw the pose of a start and its likeliest rival; the sentence that says so, or why there is no picture."""
+        path, names = self.results.path("report", QUESTION), [view.name for view in self.footage.take.views]
+        try:
+            picture = question_picture(start, self.footage.rig.cameras, names, self.footage.read_whole(start.frame))
+            store.write_bytes(path, png(picture))
+        except InputError as fault:
+            return f"There is no picture of it: {fault}"
+        return f"{path} shows what was found there" + (" and the likeliest other pose." if start.rival_m else ".")
 
     def do_without_surface(self, why: str) -> None:
         """Note that there are no clouds and no trajectories."""
@@ -264,7 +269,7 @@ def open_run(
                 notes += edited_tables.keep(results.folder, _recorded(results).get("stages", {}))
                 notes += earlier_body.keep(results.folder, _recorded(results), keys["fit"])
             notes += _remove_all(results) if restart else _remove_stale(results, before, kept)
-            if record["stages"].keys() != before.get("stages", {}).keys():  # a run that is stopped leaves no word of what is made again
+            if ASKS in before or record["stages"].keys() != before.get("stages", {}).keys():  # no word stays of what is made again
                 results.write_run(record)
             body_key = stage_keys(footage, settings | {"skin": SkinSettings()}, Path(out))["fit"]
             run = Run(footage=footage, settings=settings, results=results, keys=keys, body_key=body_key, record=record, pictured=pictures)

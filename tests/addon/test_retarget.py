@@ -71,7 +71,7 @@ def test_a_robot_to_try_it_on(blender: ModuleType) -> None:
     assert blender.ops.tricap.add_robot() == {"FINISHED"} and props.target.name == "Robot.001"
 
 
-@pytest.mark.parametrize(("origin_m", "lifted_m", "floor_m"), [(0.0, 0.0, 0.0), (0.0, -0.9, 0.0), (1.0, 1.0, 1.0), (1.9, 1.0, 1.0)])
+@pytest.mark.parametrize(("origin_m", "lifted_m", "floor_m"), [(0, 0, 0), (0, -0.9, 0), (1, 1, 1), (1.9, 1, 1), (0, 1, 1), (0, -3, -3)])
 def test_the_floor_under_a_rig(origin_m: float, lifted_m: float, floor_m: float) -> None:
     """It is at the origin or under the feet; a rig with its pelvis at the scene's origin comes to stand on the scene's floor."""
     rig = person()

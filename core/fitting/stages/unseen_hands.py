@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..context import FitContext
-from ..explained import limb_gains, misplaced
+from ..explained import explained
 from ..inputs.cloud_points import CloudPoints
 from ..limb import Limb
 from ..solve.problem import Estimate
@@ -26,7 +26,6 @@ from .turned_hands import hands_looked_for
 
 SHOWN = 15.0  # voxels
 WINDOW_S, BLEND_S = 0.2, 0.1  # before and after a frame
-ENDS = 2  # of a hand alone, by which it is compared: `Limb.ends`
 EQUAL_S = 1e-3  # differences of times
 
 
@@ -47,9 +46,7 @@ def unseen_hands(
         sigma = np.array([min(skeleton.dofs[d].prior_sigma, np.pi) for d in hand.columns]) * own
         length_m = float(fit.parameters.body(at.vector)[0][bone])
         of_end_m2 = share * length_m**2 * (sigma**2).sum() / 3
-        found.append(
-            Elsewhere(limb=hand, covariance=share[:, None, None] * np.diag(sigma**2), variance_m2=np.stack([of_end_m2] * ENDS, axis=1))
-        )
+        found.append(Elsewhere(limb=hand, covariance=share[:, None, None] * np.diag(sigma**2), variance_m2=of_end_m2[:, None]))
     return found
 
 
@@ -61,7 +58,7 @@ def _unseen(fit: FitContext, hand: Limb, points: Sequence[CloudPoints], at: Esti
         fit.monitor.check()
         state = fit.parameters.state(pose, at.vector)
         near = fit.seen(t, points[t]).near(hand, state)
-        own[t] = limb_gains(near, hand, pose[None], at.vector, FINE_M)[0] + misplaced(near, hand, state)
+        own[t] = explained(near, hand, state, FINE_M)
     clicked = [t for t, clicks in fit.clicked.items() if (clicks.joint == joint).any()]
     around = np.abs(time_s[:, None] - time_s)
     unseen = np.array([np.median(own[row <= WINDOW_S + EQUAL_S]) < SHOWN for row in around], dtype=float)

@@ -143,11 +143,12 @@ def find_start(
     rivals = _named(explanations, kept * best.probability, names)
     if 1 - kept >= UNLIKELY:
         rivals[UNTRIED] = 1 - kept
-    likely = kept * float(best.probability[0])
+    likely, uncertain = kept * float(best.probability[0]), {int(leg.limb.bones[0]) for leg in legs}
+    doubted = [leg for leg in _legs(limbs[at]) if int(leg.limb.bones[0]) in uncertain]
     return StartJoints(
         frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
-        rival_m=_rival(names, final, explanations, kept * best.probability, _legs(limbs[at]), likely),
+        rival_m=_rival(names, final, explanations, kept * best.probability, doubted, likely),
         stature=stature,
         model=fit.model.name,
         unsure=unsure,

@@ -18,6 +18,7 @@ from tricap.core.checking.take_check import check_clouds, check_first_frame
 from tricap.core.cli import main
 from tricap.core.fitting.inputs.start_joints import NeedsClick, StartJoints
 from tricap.core.fitting.stages.set_up import NobodyFound
+from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
@@ -287,6 +288,19 @@ def test_a_question_about_the_start_comes_with_a_picture(plane_take: Path, tmp_p
         assert job.results.read_run()["asks"] == str(asked.value) and decoded(picture).shape[2] == 3
         job.remove_body(())
         assert not picture.exists()
+    with open_run(plane_take, out, {}, (0, 2)) as job:
+        assert "asks" not in job.results.read_run(), "the question is asked again, if it still stands"
+
+
+def test_a_question_whose_picture_cannot_be_made_is_asked(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreadable(*_: object) -> None:
+        raise InputError("C/0001.png cannot be read.")
+
+    start = StartJoints(frame=1, xyz_m={}, stature=1.0, model="arm.R", probability=0.6, rivals={}, ask="wrist.R")
+    with open_run(plane_take, tmp_path / "out", {}, (0, 2)) as job:
+        monkeypatch.setattr(type(job.footage), "read_whole", unreadable)
+        with pytest.raises(NeedsClick, match="There is no picture of it: C/0001.png cannot be read"), job.resumable(stopped=str):
+            raise NeedsClick(start)
 
 
 def test_the_points_of_a_trunk_lie_on_its_flesh(tmp_path: Path) -> None:

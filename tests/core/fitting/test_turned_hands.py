@@ -144,8 +144,7 @@ def test_a_hand_that_is_not_seen_is_uncertain_by_centimetres(tracking, monkeypat
     monkeypatch.setattr(type(tracking.fit), "seen", lambda *_: nothing)
     hand = _added(tracking, {})
     sigma_m, variance = np.sqrt(hand.variance_m2), np.diag(hand.covariance[0])
-    ends = hand.limb.ends(_pose(TRUE)[None], tracking.first.vector)[0]
-    assert hand.covariance.shape[0] == FRAMES - 1 and sigma_m.shape == (FRAMES - 1, len(ends))
+    assert hand.covariance.shape[0] == FRAMES - 1 and sigma_m.shape == (FRAMES - 1, 1)
     assert 0.04 < sigma_m.min() and sigma_m.max() < 0.1
     own = hand.limb.columns.tolist()
     assert variance[own.index(ANGLES[0])] == 0 and np.allclose(variance[[own.index(a) for a in ANGLES[1:]]], np.radians([60, 20]) ** 2)
@@ -155,12 +154,11 @@ def test_single_frames_do_not_decide_whether_a_hand_is_seen_and_clicks_do(tracki
     T, fit = 50, tracking.fit
     own = np.where(np.arange(T) < 15, 80.0, 5.0)
     own[[4, 22]] = 5.0, 80.0
-    monkeypatch.setattr(unseen_hands, "misplaced", lambda *_: 0.0)
     monkeypatch.setattr(type(fit), "seen", lambda *_: SimpleNamespace(near=lambda *_: None))
 
     def share(clicked) -> np.ndarray:
-        explained = iter(own.tolist())
-        monkeypatch.setattr(unseen_hands, "limb_gains", lambda *_: np.array([next(explained)]))
+        found = iter(own.tolist())
+        monkeypatch.setattr(unseen_hands, "explained", lambda *_: next(found))
         return _added(tracking, clicked, T).variance_m2[:, 0]
 
     found = share({}) / share({}).max()

@@ -40,6 +40,14 @@ def test_both_poses_are_shown_and_the_joint_to_click() -> None:
     assert cv2.imencode(".png", alone)[0]
 
 
+def test_a_joint_behind_a_camera_is_left_out() -> None:
+    """Improbable poses may have one."""
+    rig, asked = three_cameras(), start()
+    behind = {**asked.rival_m, "wrist.R": np.array([0.0, 0.0, -1.0]), "ankle.L": np.array([0.3, 0.0, 1e-9])}
+    picture = question_picture(start(rival_m=behind), rig.cameras, ("L", "C", "R"), [np.zeros(c.size_px[::-1]) for c in rig.cameras])
+    assert shown(picture, RIVAL) > 100
+
+
 def test_the_question_names_the_rival_and_the_picture() -> None:
     asked = NeedsClick(start(), "OUT/report/question.png shows both.")
     assert "in frame 7 (70%): front and back. Click the right wrist" in str(asked) and str(asked).endswith("question.png shows both.")

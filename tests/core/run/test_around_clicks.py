@@ -78,14 +78,15 @@ def test_the_command(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(given) == 0
     assert "were fitted again, with the shape as it was. `tricap scene` builds" in capsys.readouterr().out
     assert main(given) == 2 and "No joints were clicked or pulled since" in capsys.readouterr().err
-    assert main([*given, "--set", "fitting.length_sigma=0.2"]) == 2 and "fit all frames, without" in capsys.readouterr().err
+    assert main([*given, "--set", "fitting.length_sigma=0.2"]) == 2 and "without --around-clicks" in capsys.readouterr().err
 
 
 def test_what_the_command_refuses(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = ["fit", str(sample), "--around-clicks", "--out"]
     assert main([*given, str(sample / "other")]) == 2 and "There is no fitted body in" in capsys.readouterr().err
     assert not (sample / "other").exists()
-    assert main([*given, str(sample / "results"), "--frames", "0:4"]) == 2 and "--frames is of a whole fit" in capsys.readouterr().err
+    assert main([*given, str(sample / "results"), "--restart"]) == 2 and "--restart is of a whole fit" in capsys.readouterr().err
+    assert main([*given, str(sample / "results"), "--frames", "0:4"]) == 2 and "with other --frames" in capsys.readouterr().err
 
 
 def test_a_body_that_is_not_ours_is_not_read(sample: Path) -> None:
