@@ -7,6 +7,7 @@ import numpy as np
 
 from ...foundation.errors import InputError
 
+UNTRIED = "whether another pose fits better"  # a rival without a pose
 SIGMA_M = 0.05  # of a joint, in a coordinate
 SIGMAS_M = {"elbow": 0.06, "wrist": 0.11, "knuckles": 0.11}  # of those that one frame hardly shows where an arm lies on the body
 
@@ -33,7 +34,7 @@ class StartJoints:
     @property
     def question(self) -> str:
         """What is uncertain and which click decides, as sentences."""
-        doubts = [name for name, _ in sorted(self.rivals.items(), key=lambda rival: -rival[1])]
+        doubts = sorted(self.rivals, key=lambda name: (name == UNTRIED, -self.rivals[name]))
         doubt = f": {' or '.join(doubts[:2])}" if doubts else ""
         side = {"L": "left ", "R": "right "}.get(self.ask[-1], "") if "." in self.ask else ""
         return (

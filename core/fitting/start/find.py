@@ -28,7 +28,7 @@ import numpy as np
 from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
-from ..inputs.start_joints import StartJoints
+from ..inputs.start_joints import UNTRIED, StartJoints
 from .limb_places import NEAR_M, LimbPlaces, limb_places
 from .pose_dictionary import known_poses
 from .refine import (
@@ -62,7 +62,6 @@ SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
 FORWARD, MOST_FORWARD = 3.0, 1.0  # log odds per m/s of walking forwards, and at most
 WALK_S = 0.3  # before and after a frame, for the velocity
-UNTRIED = "whether another pose fits better"
 UNLIKELY = 0.01  # a less probable rival is not named
 JUDGED = ("shoulder", "hip", "knee", "ankle")  # joints by which explanations are compared: of an arm all frames decide
 ASKED = (*JUDGED, "elbow", "wrist")  # joints that a person can click

@@ -6,7 +6,7 @@ import numpy as np
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.fitting.inputs.start_joints import NeedsClick, StartJoints
+from tricap.core.fitting.inputs.start_joints import UNTRIED, NeedsClick, StartJoints
 from tricap.core.report.question import ASKED, FOUND, LEFT, RIVAL, question_picture
 
 from ..conftest import DEPTH_M, three_cameras
@@ -51,4 +51,6 @@ def test_a_joint_behind_a_camera_is_left_out() -> None:
 def test_the_question_names_the_rival_and_the_picture() -> None:
     asked = NeedsClick(start(), "OUT/report/question.png shows both.")
     assert "in frame 7 (70%): front and back. Click the right wrist" in str(asked) and str(asked).endswith("question.png shows both.")
+    both = start(rivals={UNTRIED: 0.2, "front and back": 0.1}).question
+    assert "(70%): front and back or whether another pose fits better. Click" in both
     assert asked.joint == "wrist.R" and asked.frame == 7 and "(70%). Click" in start(rivals={}).question
