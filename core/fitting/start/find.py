@@ -138,16 +138,16 @@ def find_start(
     unsure = tuple(joint for arm in arms if arm.certainty < LEAST_CERTAINTY for joint in arm.doubt)
     final, stature = with_lengths(fit, thinned_points(points_of(at)), clicked[at], last)
     kept = (1 - doubt) * float(np.exp(-0.5 * (missed_m(fit, final) / MISSED_M) ** 2))
-    explanations = [one.at(at) for one in best.followed]
-    rivals = _named(explanations, kept * best.probability, names)
+    explanations, probability = [one.at(at) for one in best.followed], kept * best.probability
+    likely, rivals = float(probability[0]), _named(explanations, probability, names)
     if 1 - kept >= UNLIKELY:
         rivals[UNTRIED] = 1 - kept
-    likely, uncertain = kept * float(best.probability[0]), {int(leg.limb.bones[0]) for leg in legs}
+    uncertain = {int(leg.limb.bones[0]) for leg in legs}
     doubted = [leg for leg in _legs(limbs[at]) if int(leg.limb.bones[0]) in uncertain]
     return StartJoints(
         frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
-        rival_m=_rival(names, final, explanations, kept * best.probability, doubted, likely),
+        rival_m=_rival(names, final, explanations, probability, doubted),
         stature=stature,
         model=fit.model.name,
         unsure=unsure,
@@ -313,15 +313,16 @@ def _rival(
     explanations: Sequence[Explanation],
     probability: np.ndarray,
     legs: Sequence[LimbPlaces],
-    likely: float,
 ) -> dict[str, np.ndarray]:
-    """The joints of the likeliest other explanation: one of the `explanations`, the best first, or the `final` one, which is as `likely`
-    as that, with a leg elsewhere; empty if none has a probability."""
+    """The joints of the likeliest other explanation: one of the `explanations`, the best first, or the `final` one, which comes from the
+    best, with a leg elsewhere; empty if none has a probability."""
     found = [(p, dict(zip(names, one.joints_m))) for one, p in zip(explanations[1:], probability[1:].tolist())]
     for leg in legs:
         k = int(np.argmax(np.where(leg.off_m.max(axis=1) > NEAR_M, leg.probability, -1.0)))
         joints = [leg.limb.parameters.skeleton.bones[bone].tail_joint for bone in leg.limb.bones.tolist()]
-        found.append((likely * (1 - leg.certainty), {**dict(zip(names, final.joints_m)), **dict(zip(joints, leg.ends_m[k]))}))
+        found.append(
+            (float(probability[0]) * (1 - leg.certainty), {**dict(zip(names, final.joints_m)), **dict(zip(joints, leg.ends_m[k]))})
+        )
     p, joints_m = max(found, key=lambda one: one[0], default=(0.0, dict[str, np.ndarray]()))
     return joints_m if p >= UNLIKELY else {}
 
