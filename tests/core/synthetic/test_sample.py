@@ -1,5 +1,6 @@
 """The sample of the extension: small, valid with this code, near the truth, and only from its own kind of archive."""
 
+import tomllib
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -41,8 +42,13 @@ def test_its_recording_is_the_one_that_is_made(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(sample, "RECORDING", replace(RECORDING, frames=2))
     make_recording(tmp_path / "made")
     unpack(ARCHIVE, tmp_path / "there")
-    for name in ("take.toml", "rig.toml"):
-        assert (tmp_path / "made" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
+    assert (tmp_path / "made" / "take.toml").read_bytes() == (tmp_path / "there" / "take.toml").read_bytes()
+    made_rig, rig = (tomllib.loads((tmp_path / place / "rig.toml").read_text(encoding="utf-8")) for place in ("made", "there"))
+    assert made_rig.keys() == rig.keys() and made_rig.pop("metadata") == rig.pop("metadata")
+    for name, camera in rig.items():
+        assert made_rig[name].pop("name") == camera.pop("name") and made_rig[name].keys() == camera.keys()
+        for key, numbers in camera.items():
+            assert np.abs(np.subtract(made_rig[name][key], numbers)).max() < 1e-12, "other machines round otherwise"
     made, there = (decoded(tmp_path / place / "C" / "0001.jpg").astype(float) for place in ("made", "there"))
     assert np.abs(made - there).mean() < 0.5, "other machines round otherwise"
 
