@@ -13,10 +13,11 @@ from ..editing.curves import replace_keys, sigma_curves
 from ..operators.stages import Fit, StageOperator, run_and_read
 from ..overlay import canvas, results
 from ..retarget import base_layer
-from ..scene import stored
+from ..scene import built, stored
 from ..scene.action import place_sigmas
+from ..scene.action_curves import curves_of
 from ..scene.rest_pose import REST_POSE_KEY, with_rest_pose
-from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, controls_of_body, curves_of
+from ..scene.standing import LIFT_KEY, MEASURED_KEY, Standing, all_bodies, controls_of_body
 
 if TYPE_CHECKING:
     from ...core.run.around_clicks import FittedAgain
@@ -95,20 +96,23 @@ def move_keys(body: bpy.types.Object, again: "FittedAgain") -> None:
     moved = {(f'pose.bones["{c.bone}"].{c.path}', c.index): c.sign * change[name] for name, c in channels.items() if name in change}
     measured = stored.data_block(body, MEASURED_KEY, bpy.types.Action)
     actions = {action for action in (body.animation_data and body.animation_data.action, measured) if action is not None}
-    for curve in (curve for action in actions for curve in curves_of(action)):
-        if (curve.data_path, curve.array_index) in moved:
-            before = np.array([curve.evaluate(frame) for frame in again.frames])
-            replace_keys(curve, again.frames, before + moved[curve.data_path, curve.array_index])
+    with built.no_edit(actions):
+        for curve in (curve for action in actions for curve in curves_of(action)):
+            if (curve.data_path, curve.array_index) in moved:
+                before = np.array([curve.evaluate(frame) for frame in again.frames])
+                replace_keys(curve, again.frames, before + moved[curve.data_path, curve.array_index])
 
 
 def renew_sigmas(body: bpy.types.Object, again: "FittedAgain") -> None:
     """Give the sigmas of a body, those of its angles and of the places of its bones, the values of the new fit in its frames."""
     shape, _, sigma = with_rest_pose(again.shape, again.after, again.sigma, _pose_of(body))
     new = dict(zip(again.dof_names, sigma.T)) | place_sigmas(shape, again.joints, again.frames)
-    for name, curve in sigma_curves(body).items():
-        values = new.get(name.removeprefix("sigma "))
-        if values is not None:
-            replace_keys(curve, again.frames, values)
+    curves = sigma_curves(body)
+    with built.no_edit({curve.id_data for curve in curves.values()}):
+        for name, curve in curves.items():
+            values = new.get(name.removeprefix("sigma "))
+            if values is not None:
+                replace_keys(curve, again.frames, values)
 
 
 def _pose_of(body: bpy.types.Object) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ..scene import stored
 from ..scene.action import UNCERTAINTY, set_keys
-from ..scene.standing import MEASURED_KEY, controls_of_body, curves_of
+from ..scene.action_curves import curves_of
+from ..scene.standing import MEASURED_KEY, controls_of_body
 
 EDITED = "Edited motion"
 BONE = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.?(.*)')

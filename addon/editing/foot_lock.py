@@ -24,8 +24,10 @@ from ...core.motion.retarget.roles import sided
 from ..retarget.apply import map_of
 from ..retarget.playing import keyed_frames
 from ..retarget.read import read_motion, read_rig
+from ..scene import built
 from ..scene.action import key
-from ..scene.standing import all_bodies, bags_of, controls_of_body, dofs_of
+from ..scene.action_curves import bags_of
+from ..scene.standing import all_bodies, controls_of_body, dofs_of
 from .curves import edited_action, motion_curves
 
 LOCK, EMPTY, ACTION = "Foot lock", "Foot Lock", "Foot lock"
@@ -55,13 +57,14 @@ def lock_feet(body: bpy.types.Object) -> str:
     spans = {side: runs(contacts.ankle[side]) for side in contacts.sides}
     if not any(spans.values()):
         raise InputError("No foot stands on the floor in these frames; nothing to lock.")
-    edited_action(body)
     blend = max(1, round(FeetSettings().blend_s * motion.fps))
-    for side, standing in spans.items():
-        if standing:
-            _lock(body, motion, side, rig_map, standing, blend)
+    with built.no_edit([edited_action(body)]):
+        for side, standing in spans.items():
+            if standing:
+                _lock(body, motion, side, rig_map, standing, blend)
     lowered = _lower_pelvis(body, motion, rig_map, spans, blend)
     counted = ", ".join(f"foot {side} {len(standing)} times" for side, standing in spans.items())
+    built.mark_actions(action for lock in _empties(body) for action in built.actions_of(lock))
     less = f" The pelvis is lowered by up to {1e3 * lowered:.0f} mm, so that straight legs reach." if lowered else ""
     return f"Locked: {counted}.{less}{_missed(body, motion, rig_map, spans)}"
 
@@ -104,6 +107,7 @@ def _empty(body: bpy.types.Object, name: str) -> bpy.types.Object:
     empty = bpy.data.objects.new(f"{EMPTY}.{name}", None)
     empty.empty_display_type, empty.empty_display_size, empty.rotation_mode = "ARROWS", 0.1, "QUATERNION"
     body.users_collection[0].objects.link(empty)
+    built.mark_name(empty)
     empty.animation_data_create().action = bpy.data.actions.new(f"{ACTION} {name}")
     return empty
 
@@ -186,6 +190,12 @@ def _locks(body: bpy.types.Object) -> list[tuple[bpy.types.PoseBone, bpy.types.C
     return [(bone, constraint) for bone in body.pose.bones for constraint in bone.constraints if constraint.name.startswith(LOCK)]
 
 
+def _empties(body: bpy.types.Object) -> set[bpy.types.Object]:
+    """The objects that the foot lock of a body follows."""
+    targets = (getattr(constraint, "target", None) for _, constraint in _locks(body))
+    return {target for target in targets if target is not None}
+
+
 def is_locked(body: bpy.types.Object) -> bool:
     """Whether the body has a foot lock, muted or not."""
     return bool(_locks(body))
@@ -218,14 +228,14 @@ def activate_all(scene: bpy.types.Scene, active: bool) -> None:
 
 def remove(body: bpy.types.Object) -> bool:
     """Remove the foot lock of the body with its keys; whether it had one."""
-    locks = _locks(body)
-    empties = {target for _, constraint in locks if (target := getattr(constraint, "target", None)) is not None}
+    locks, empties = _locks(body), _empties(body)
     for bone, constraint in locks:
         bone.constraints.remove(constraint)
     action = body.animation_data.action if body.animation_data is not None else None
-    for bag in bags_of(action) if action is not None else ():
-        for curve in [curve for curve in bag.fcurves if f'.constraints["{LOCK}' in curve.data_path]:
-            bag.fcurves.remove(curve)
+    with built.no_edit([action] if action is not None else []):
+        for bag in bags_of(action) if action is not None else ():
+            for curve in [curve for curve in bag.fcurves if f'.constraints["{LOCK}' in curve.data_path]:
+                bag.fcurves.remove(curve)
     actions = {empty.animation_data.action for empty in empties if empty.animation_data is not None} - {None}
     bpy.data.batch_remove(empties)
     bpy.data.batch_remove({action for action in actions if action.users == 0})

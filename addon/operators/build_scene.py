@@ -1,7 +1,7 @@
 """bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity", …)"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -132,12 +132,18 @@ def put_into_scene(
     options: SceneOptions = DEFAULTS,
 ) -> None:
     """Build the scene and report its contents; the first time, frame the body in the 3-D views. Else those that look through the camera
-    still do, though it is another one."""
+    still do, though it is another one, and what was done with the earlier body is done with the new one (`kept_work`)."""
+    from ..editing.kept_work import Work
     from ..scene.build import write_scene
 
-    first = armature.NAME not in bpy.data.objects
+    first, work = armature.NAME not in bpy.data.objects, Work.of(context.scene)
     through = [view for view in _views(context) if view.view_perspective == "CAMERA"]
-    report_scene(operator, write_scene(contents, blend, options))
+
+    def replaced(edited: Sequence[bpy.types.Action]) -> None:
+        for kind, sentence in work.again(context.scene, edited) if work is not None else ():
+            operator.report({kind}, sentence)
+
+    report_scene(operator, write_scene(contents, blend, options, replaced=replaced))
     body = bpy.data.objects.get(armature.NAME)
     chosen = context.scene.tricap_retarget
     if body is not None:
@@ -160,7 +166,8 @@ def show_so_far(operator: bpy.types.Operator, context: bpy.types.Context, conten
     A scene with a body stays as it is, with its edits, and so does one whose cameras were calibrated or imported in it: they would be there
     twice. The first time, the 3-D views look through the scene's camera.
     """
-    from ..scene.build import built_collections, write_scene
+    from ..scene.build import write_scene
+    from ..scene.earlier import built_collections
 
     collections = built_collections(context.scene)
     built = {thing for collection in collections for thing in collection.all_objects}

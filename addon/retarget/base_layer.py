@@ -19,7 +19,7 @@ from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
 from ..editing import foot_lock
-from ..scene import stored
+from ..scene import built, stored
 from ..scene.standing import ROOT
 from . import metarig
 from .read import check_plays, orthonormal, read_motion, read_rig, world_matrix
@@ -46,6 +46,7 @@ def bake(rig: bpy.types.Object, body: bpy.types.Object, motion: Motion) -> None:
     rig.animation_data.action = bpy.data.actions.new(CORRECTIONS)
     rig.animation_data.action_blend_type, rig.animation_data.action_extrapolation = "COMBINE", "HOLD"
     rig[BASE_KEY], rig[BAKED_KEY] = written.action, bpy.context.scene.frame_current
+    built.mark_actions([written.action])
 
 
 def check_bakes(rig: bpy.types.Object, body: bpy.types.Object) -> None:
@@ -80,7 +81,8 @@ def bake_again(rig: bpy.types.Object, body: bpy.types.Object, frames: Sequence[i
             scene.frame_set(int(stored.number(rig, BAKED_KEY) or 0))
             motion = read_motion(body, read_rig(body), inside)
             rig.matrix_world = body.matrix_world
-            replace_frames(rig, action, _of_controls(rig, body, motion))
+            with built.no_edit([action]):
+                replace_frames(rig, action, _of_controls(rig, body, motion))
     finally:
         rig.matrix_basis = place
         scene.frame_set(now)

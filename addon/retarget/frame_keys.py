@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import bpy
 
-from ..scene.standing import curves_of
+from ..scene.action_curves import curves_of
 
 Channel = tuple[str, str]  # bone, and path of one of its channels or custom properties, such as '["IK_FK"]'
 Pose = dict[Channel, object]

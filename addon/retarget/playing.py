@@ -22,8 +22,8 @@ from ...core.motion.plausible import check_span
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.results.listed_files import PLY, check_files, list_files
 from ..scene import layers, stored
+from ..scene.action_curves import curves_of
 from ..scene.armature import JOINTS_KEY
-from ..scene.standing import curves_of
 from .read import action_frames, check_plays, read_rig, reading_motion
 
 RIGID = "Tricap rigid"  # the modifier of the copy of a mesh whose parent is a bone

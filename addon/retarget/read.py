@@ -20,8 +20,8 @@ from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
 from ...core.motion.retarget.transfer import standing_turn
 from ..scene import layers, stored
+from ..scene.action_curves import curves_of
 from ..scene.armature import ROLES_KEY
-from ..scene.standing import curves_of
 
 A = TypeVar("A")
 UNIFORM = 1e-3  # relative tolerance between the scales along the axes

@@ -4,7 +4,7 @@ read_contents (any thread) → write_scene (main thread) → save_blend
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,19 +26,19 @@ from ...core.results.folder import FIELDS
 from ...core.results.outputs import check_replaceable
 from ...core.run.stages import STAGES
 from ...core.take.footage import Footage
-from . import action, armature, cameras, clips, excluded, footage_plane, layers, metaballs, nodes, skin, standing, stored, surroundings
+from . import action, armature, built, cameras, clips, excluded, footage_plane, layers, metaballs, skin, standing, stored, surroundings
 from .cloud import CloudPoints, add_cloud, pixel_size_m
 from .contents import Contents, read_contents
+from .earlier import Earlier
 from .frame_rate import set_rate
 from .looking import look_at
-from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PLACES_KEY, POINTS_KEY, SceneOptions
+from .options import DEFAULTS, KEYS_KEY, OUT_KEY, PART_KEY, PLACES_KEY, POINTS_KEY, SceneOptions
 from .rest_pose import REST_POSE_KEY, with_rest_pose
 from .trajectories import add_arrows, add_bends, add_removed, add_trajectories, sparser, trail_radius_m
 
 COLLECTION = "Tricap"
 MOST_STRAY = 1  # images by which the footage may be shown at another moment without a word
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
-PART_KEY = "tricap_part"  # custom property of the collections in it: Body, Cameras, Measured, …
 DOUBTFUL = "Doubtful"  # the first word of the timeline's markers of doubtful stretches
 
 
@@ -67,9 +67,16 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
 
 
 def write_scene(
-    contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS, monitor: Monitor | None = None
+    contents: Contents,
+    blend: Path | None = None,
+    options: SceneOptions = DEFAULTS,
+    monitor: Monitor | None = None,
+    replaced: Callable[[Sequence[bpy.types.Action]], None] | None = None,
 ) -> SceneReport:
-    """The second half of `build_scene`: main thread only. Everything that can fail comes before the removal of an earlier build."""
+    """The second half of `build_scene`: main thread only. Everything that can fail comes before the removal of an earlier build.
+
+    `replaced` is called when that is done, before the file is saved, with the edited actions of the earlier build, which stay.
+    """
     if options.exact_skin and blend is None:
         raise InputError("The exact skin is saved next to the Blender file; give the Blender file a name.")
     if options.exact_skin and blend is not None:
@@ -79,7 +86,7 @@ def write_scene(
         bpy.ops.object.mode_set(mode="OBJECT")
     surface = _implicit_surface(contents, options, monitor) if options.implicit else None
     opened = _opened_clips(scene, contents)
-    warnings = [*contents.warnings, *remove_earlier()]
+    warnings, earlier = [*contents.warnings], Earlier.set_aside(scene)
     collection = bpy.data.collections.new(COLLECTION)
     collection[OUT_KEY] = str(contents.out)
     collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
@@ -106,6 +113,10 @@ def write_scene(
     mark_doubtful(scene, contents.doubtful)
     if contents.bar is not None:
         counts["positions of the bar"] = _add_bar(_part(collection, "Bar"), contents.frames[0], *contents.bar)
+    built.mark(collection)
+    earlier.remove(scene, collection)
+    if replaced is not None:
+        replaced(earlier.edited)
     scene.frame_set(scene.frame_start)
     if bpy.app.background and (armature_object := next(standing.all_bodies(scene), None)) is not None:
         look_at(armature_object)
@@ -140,51 +151,6 @@ def _places(contents: Contents, folder: Path) -> dict[str, str]:
         with suppress(ValueError):
             places[name] = os.path.relpath(real_path(place), folder)
     return places
-
-
-def built_collections(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The collections of earlier builds in a scene."""
-    return [child for child in scene.collection.children_recursive if OUT_KEY in child]
-
-
-def remove_earlier() -> list[str]:
-    """Remove the collections of earlier builds from this scene, with their objects, their control rigs and the data that nothing else uses.
-
-    Returns a sentence for each control rig that was removed.
-    """
-    scene, removed = bpy.context.scene, []
-    for collection in built_collections(scene):
-        objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
-        for rig in filter(None, [stored.data_block(o, standing.RIG_KEY, bpy.types.Object) for o in objects]):
-            removed.append(f"The control rig “{rig.name}” was removed with the earlier body{_keep_corrections(rig)}.")
-            objects += [rig, *{bone.custom_shape for bone in rig.pose.bones if bone.custom_shape is not None}]
-        used = {id_ for o in objects for id_ in (o.data, o.animation_data.action if o.animation_data else None) if id_ is not None}
-        used |= set(filter(None, [stored.data_block(o, standing.MEASURED_KEY, bpy.types.Action) for o in objects]))
-        used |= {s.action for o in objects if o.animation_data for t in o.animation_data.nla_tracks for s in t.strips if s.action}
-        used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}
-        used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
-        used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
-        used |= {image for material in used if isinstance(material, bpy.types.Material) for image in nodes.images_of(material)}
-        if scene.active_clip in used:
-            scene.active_clip = None
-        widgets = {child for o in objects if o.type == "MESH" for child in o.users_collection if child.name.startswith("WGTS_")}
-        inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child or PART_KEY in child]
-        bpy.data.batch_remove(objects)
-        bpy.data.batch_remove([*inside, *(child for child in widgets if not child.all_objects), collection])
-        for _ in range(3):  # first meshes and node groups, then their materials, then the images of these have no users
-            free = {id_ for id_ in used if id_.users == 0}
-            used -= free
-            bpy.data.batch_remove(free)
-    return removed
-
-
-def _keep_corrections(rig: bpy.types.Object) -> str:
-    """Keep the action with corrections of a control rig, if it has keys; the end of the sentence that says so."""
-    corrections = rig.animation_data.action if rig.animation_data is not None else None
-    if corrections is None or not corrections.layers:
-        return ""
-    corrections.use_fake_user = True
-    return f"; its action “{corrections.name}” is kept"
 
 
 def set_time(scene: bpy.types.Scene, contents: Contents) -> None:

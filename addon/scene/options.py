@@ -7,6 +7,7 @@ from ...core.body.skin.mesh import DETAIL
 
 POINTS_KEY = "tricap_points"  # custom property of the collection Measured: cloud and trajectories
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
+PART_KEY = "tricap_part"  # custom property of the collections in it: Body, Cameras, Measured, …
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
 KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
 

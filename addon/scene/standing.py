@@ -21,7 +21,8 @@ from ...core.body.shape import BodyShape
 from ...core.body.skeleton import bone_frames
 from ...core.foundation.errors import InputError
 from ..session import get_session
-from . import stored
+from . import built, stored
+from .action_curves import curves_of
 
 ROOT = "root"
 LIFT_KEY = "tricap_lift_m"  # custom property of armature data: by how much the rest pose of a standing body is raised
@@ -144,9 +145,10 @@ def carry_path(scene: bpy.types.Scene, by: Path) -> None:
             body.location.xy = (0.0, 0.0)
         elif by == Path.OBJECT and curves:  # its curves take the place of where the user put the object
             body.delta_location.xy += body.location.xy
-        for curve in curves:
-            curve.data_path = OBJECT_PATH if by == Path.OBJECT else root.path_from_id("location")
-            curve.mute = by == Path.IN_PLACE
+        with built.no_edit(built.actions_of(body)):
+            for curve in curves:
+                curve.data_path = OBJECT_PATH if by == Path.OBJECT else root.path_from_id("location")
+                curve.mute = by == Path.IN_PLACE
         root.location[:2] = (0.0, 0.0)
         body.update_tag()
     scene.frame_set(scene.frame_current)
@@ -179,13 +181,14 @@ def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
         shift = -lower_m * float(np.sign(bone.bone.matrix_local[2][height["index"]]))
         path = bone.path_from_id("location")
         bone.location[height["index"]] += shift
-        for curve in (curve for action in _actions(body) for curve in curves_of(action)):
-            if curve.data_path == path and curve.array_index == height["index"]:
-                for point in curve.keyframe_points:
-                    point.co[1], point.handle_left[1], point.handle_right[1] = (
-                        at[1] + shift for at in (point.co, point.handle_left, point.handle_right)
-                    )
-                curve.update()
+        with built.no_edit(built.actions_of(body)):
+            for curve in (curve for action in built.actions_of(body) for curve in curves_of(action)):
+                if curve.data_path == path and curve.array_index == height["index"]:
+                    for point in curve.keyframe_points:
+                        point.co[1], point.handle_left[1], point.handle_right[1] = (
+                            at[1] + shift for at in (point.co, point.handle_left, point.handle_right)
+                        )
+                    curve.update()
         body.update_tag()
     for thing in scene.objects:
         if thing.name.split(".")[0] == FLOOR:
@@ -194,25 +197,7 @@ def stand_on(scene: bpy.types.Scene, height_m: float) -> None:
     get_session().file.changed = True
 
 
-def _actions(body: bpy.types.Object) -> set[bpy.types.Action]:
-    """The actions that move a body: the active one, those in its layers, and the measured one."""
-    data = body.animation_data
-    strips = [strip.action for track in data.nla_tracks for strip in track.strips] if data is not None else []
-    active, measured = data.action if data is not None else None, stored.data_block(body, MEASURED_KEY, bpy.types.Action)
-    return {action for action in (active, measured, *strips) if action is not None}
-
-
 def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:
     """The curves of x and y of the path, in every action that the body plays."""
     paths = (OBJECT_PATH, body.pose.bones[ROOT].path_from_id("location"))
-    return [curve for action in _actions(body) for curve in curves_of(action) if curve.data_path in paths and curve.array_index < 2]
-
-
-def bags_of(action: bpy.types.Action) -> list[bpy.types.ActionChannelbag]:
-    """The bags with the curves of an action, one for each slot."""
-    return [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
-
-
-def curves_of(action: bpy.types.Action) -> list[bpy.types.FCurve]:
-    """All curves of an action."""
-    return [curve for bag in bags_of(action) for curve in bag.fcurves]
+    return [curve for action in built.actions_of(body) for curve in curves_of(action) if curve.data_path in paths and curve.array_index < 2]

@@ -24,6 +24,8 @@ from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.motion.formats.ply import write_cloud, write_mesh
 from tricap.core.motion.tables import write_joints, write_motion
 
+from .walking import walking_out, walking_person, walking_skin  # noqa: F401  fixtures
+
 if importlib.util.find_spec("bpy"):
     import bpy  # noqa: F401  Blender's own modules, such as addon_utils, are found only after it
 

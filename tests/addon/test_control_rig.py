@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Quaternion
 
-from tricap.addon.scene.standing import curves_of
+from tricap.addon.scene.action_curves import curves_of
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.geometry.rotation import angle_of, transposed, twist_about
@@ -458,22 +458,6 @@ def test_a_body_that_was_placed_by_hand_and_a_second_rig(blender: ModuleType) ->
     assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
     check_same(pose(body), wanted, ANGLE_DEG, PLACE_M)
     assert [o.name for o in blender.data.objects if o.type == "ARMATURE"] == ["Body", "Body controls"]
-    a_rebuilt_body_leaves_no_control_rig(blender, body)
-
-
-def a_rebuilt_body_leaves_no_control_rig(bpy: ModuleType, body: Any) -> None:
-    from tricap.addon.scene import build
-
-    bpy.data.objects["Body controls"].pose.bones["chest"].keyframe_insert("rotation_quaternion")
-    built = bpy.data.collections.new(build.COLLECTION)
-    built[build.OUT_KEY] = "earlier"
-    bpy.context.scene.collection.children.link(built)
-    bpy.context.scene.collection.objects.unlink(body)
-    built.objects.link(body)
-    (sentence,) = build.remove_earlier()
-    assert "“Body controls” was removed" in sentence and sentence.endswith("is kept.")
-    assert not bpy.data.objects and not [c for c in bpy.data.collections if c.name.startswith("WGTS")]
-    assert any(action.name.startswith("Corrections") and action.use_fake_user for action in bpy.data.actions)
 
 
 def test_a_control_rig_needs_a_whole_body(blender: ModuleType, small_run: Any) -> None:
