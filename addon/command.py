@@ -14,6 +14,7 @@ from ..core.cli.arguments import check_simplify, refuse_unused, standard_output_
 from ..core.foundation import bounded
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
+from .blender_module import load_blender
 from .retarget import command as retargeting
 
 FROM_DEG, TURN_DEG, ELEVATION_DEG = -45.0, 90.0, 12.0  # of the film of a scene: from one side of the cameras to the other
@@ -90,7 +91,9 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: there is no Blender in this Python, or the input is invalid.
         Cancelled: the monitor was cancelled; no file was written.
     """
-    if importlib.util.find_spec("bpy") is None:
+    with standard_output_kept_clean(args):
+        blender = load_blender()
+    if not blender:
         raise InputError(
             "`tricap scene` needs Blender: use `blender --command tricap scene …`, or Python 3.11 or 3.13 with the module bpy."
         )

@@ -6,6 +6,7 @@ from pathlib import Path
 from ..core.foundation import bounded
 from ..core.foundation.errors import InputError
 from ..core.synchronising.sound import Sound, sound_of
+from .blender_module import load_blender
 
 
 def movie_sound(path: Path) -> Sound | None:
@@ -14,8 +15,7 @@ def movie_sound(path: Path) -> Sound | None:
     Raises:
         InputError: the movie cannot be opened, or its sound is too long.
     """
-    import bpy  # noqa: F401
-
+    load_blender()
     aud = import_module("aud")  # where Blender is a Python module, bpy makes it known
     try:
         bounded.check_file(path, bounded.MOVIE_BYTES)

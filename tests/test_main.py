@@ -1,5 +1,7 @@
 """`python -m tricap`: one parser for the commands of the core and those of the add-on, without starting Blender for the former."""
 
+import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +91,26 @@ def test_importing_the_package_loads_nothing_of_blender() -> None:
     )
     assert done.stdout.strip() == "[]", done.stderr
     assert callable(tricap.register) and callable(tricap.unregister)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only its loader searches so")
+def test_no_child_process_searches_libraries_in_the_working_folder(tmp_path: Path) -> None:
+    code = "import os, tricap.core, cv2; print(os.environ['LD_LIBRARY_PATH'])"
+    for given in (None, "", ":", "/a::/b:"):
+        environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
+        environment |= {} if given is None else {"LD_LIBRARY_PATH": given}
+        done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, env=environment, cwd=tmp_path)
+        entries = done.stdout.strip().split(":")
+        assert all(Path(entry).is_absolute() for entry in entries) and ("/b" in entries) == bool(given and "b" in given), done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux" or not importlib.util.find_spec("bpy"), reason="Blender as a module, and pipes")
+def test_blender_loads_no_plugins_of_the_working_folder(tmp_path: Path) -> None:
+    (tmp_path / "plugins").mkdir()
+    os.mkfifo(tmp_path / "plugins" / "evil.so")  # whoever opens it waits
+    line = [sys.executable, "-P", "-m", "tricap", "scene", "none", "--blend", "a.blend", "--quiet"]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S / 9)
+    assert done.returncode == 2 and "none" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a working folder cannot be deleted on Windows")

@@ -1,7 +1,6 @@
 """`tricap retarget …` and `tricap export …`; importing this module does not need bpy, running the commands mostly does."""
 
 import argparse
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.results.folder import check_not_result
 from ...core.results.outputs import check_replaceable
+from ..blender_module import load_blender
 
 FORMAT, PICTURE = "tricap-retarget", "picture"  # of the figures of --report; and their entry with the digest of its picture
 # those of programs.py and of core/motion/formats/markers.py, which are imported when a command runs
@@ -95,7 +95,7 @@ def _check_axes(args: argparse.Namespace) -> None:
 
 
 def _need_blender(what: str) -> None:
-    if importlib.util.find_spec("bpy") is None:
+    if not load_blender():
         raise InputError(f"`tricap {what}` needs Blender: install bpy in this Python, or use `blender --command tricap {what} …`.")
 
 

@@ -6,6 +6,7 @@ arithmetic. Faults are OSError and ValueError, which every reader turns into the
 """
 
 import errno
+import fnmatch
 import io
 import json
 import os
@@ -149,14 +150,24 @@ def matching(folder: Path, pattern: str) -> list[Path]:
         for part in parts[:-1]:
             inside = sorted((path for outer in folders for path in _folders(outer, part)), reverse=True)
             folders = list({_identity(path): path for path in inside}.values())
-        return [path for outer in folders for path in outer.glob(parts[-1])]
+        return [path for outer in folders for path in _named(outer, parts[-1])]
     except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
+        return []
+
+
+def _named(outer: Path, part: str) -> list[Path]:
+    """What a part of a pattern names in a folder. The time of pathlib's own matching grows exponentially with the wildcards."""
+    if part == "**" or not WILDCARDS.intersection(part):
+        return [*outer.glob(part)]
+    try:
+        return [outer / name for name in fnmatch.filter(os.listdir(outer), part)]
+    except OSError:  # as pathlib: no folder, or none that may be read
         return []
 
 
 def _folders(outer: Path, part: str) -> list[Path]:
     """The folders that a part of a pattern names; of a pattern with wildcards without those that we wrote, and what is inside these."""
-    found = [path for path in outer.glob(part) if path.is_dir()]
+    found = [path for path in _named(outer, part) if path.is_dir()]
     if not WILDCARDS.intersection(part):
         return found
     ours = {path for path in found if path != outer and (is_of_a_run(path) or _begins(path / LISTED_FILES, b"["))}

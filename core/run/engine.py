@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..foundation.errors import InputError
@@ -53,9 +54,12 @@ def dask_client(engine: Engine) -> Iterator[Any]:
         with client:
             yield client
         return
-    quiet = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": engine.retries}
-    with dask.config.set(quiet), ExitStack() as running:
+    settings = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": engine.retries}
+    with ExitStack() as running:
         try:
+            # Else Dask writes to files of fixed names in the folder of all users' temporary files, where others may have put links.
+            private = running.enter_context(TemporaryDirectory(prefix="tricap-dask-", ignore_cleanup_errors=True))
+            running.enter_context(dask.config.set({**settings, "temporary-directory": private}))
             cluster = running.enter_context(
                 LocalCluster(
                     n_workers=engine.workers,
@@ -66,6 +70,7 @@ def dask_client(engine: Engine) -> Iterator[Any]:
                     scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # by default one port, which another batch may have
                     memory_limit=0,
                     silence_logs=50,
+                    local_directory=private,
                     env=thread_limits(engine.workers, os.cpu_count() or 1),
                 )
             )

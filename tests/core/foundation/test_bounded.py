@@ -85,6 +85,15 @@ def test_a_pattern_through_links_in_circles_is_matched_in_a_moment(tmp_path: Pat
     assert time.process_time() - began < SECONDS
 
 
+@pytest.mark.parametrize("wildcard", ["*a", "[a-b]*", "?*"])
+def test_a_pattern_of_many_wildcards_is_matched_in_a_moment(tmp_path: Path, wildcard: str) -> None:
+    (tmp_path / ("a" * 240 + ".png")).write_bytes(b"")
+    began = time.process_time()
+    for folder in ("", f"{wildcard * 40}c/"):
+        assert bounded.matching(tmp_path, f"{folder}{wildcard * 60}c.png") == []
+    assert time.process_time() - began < SECONDS
+
+
 def test_patterns_are_matched_as_people_write_them(tmp_path: Path) -> None:
     for name in ("L/a/0.png", "L/b/1.png", "R/2.png", "3.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -279,14 +279,23 @@ def test_a_bvh_keeps_the_time_of_a_motion_without_all_its_frames(tmp_path: Path,
 
 def test_gaps_that_would_make_a_file_many_times_longer_are_refused(tmp_path: Path) -> None:
     """1.3 kB of text became 480 MB."""
-    points = Markers(names=("a",), fps=25.0, frames=[0, 1, 2, 3_000_000], xyz_m=np.ones((4, 1, 3)), sigma_m=np.ones((4, 1)))
-    with pytest.raises(InputError, match="a.c3d cannot be written: there are points from frame 0 to 3e[+]06, with values for 4 alone"):
+    points = Markers(names=("a",), fps=25.0, frames=[0, 1, 2, 1_000_000], xyz_m=np.ones((4, 1, 3)), sigma_m=np.ones((4, 1)))
+    with pytest.raises(InputError, match="a.c3d cannot be written: there are points from frame 0 to 1e[+]06, with values for 4 alone"):
         write_c3d(tmp_path / "a.c3d", points)
     motion = flail(person(), 2001)
     with pytest.raises(InputError, match="BVH has a row for every frame; there is a motion from frame 0 to"):
         write_bvh(tmp_path / "a.bvh", replace(motion, frames=np.append(np.arange(2000), 150_000), residual=None))
     write_trc(tmp_path / "a.trc", points)
     assert [path.name for path in tmp_path.iterdir()] == ["a.trc"] and (tmp_path / "a.trc").stat().st_size < 1000
+
+
+def test_frames_that_blender_does_not_have_are_refused() -> None:
+    """A motion from frame 2,000,000 on was written, and played in no frame."""
+    points = dict(names=("a",), fps=25.0, xyz_m=np.ones((2, 1, 3)), sigma_m=np.ones((2, 1)))
+    Markers(frames=[-1_048_574, 1_048_574], **points)
+    for frames in ([0, 1_048_575], [-2_000_000, -1_999_999]):
+        with pytest.raises(InputError, match="beyond 1048574, Blender's last"):
+            Markers(frames=frames, **points)
 
 
 def test_a_small_bvh(tmp_path: Path) -> None:

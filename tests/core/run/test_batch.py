@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -227,3 +228,24 @@ def test_the_workers_of_this_machine_cannot_be_reached_from_others(monkeypatch: 
     with pytest.raises(KeyboardInterrupt), dask_client(Engine(workers=1)):
         pass
     assert given["host"] == "127.0.0.1" and given["dashboard_address"] is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_dask_works_in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its usual one has one name for all users of the machine, is searched for modules, and its locks are truncated."""
+    (tmp_path / "letter.txt").write_text("mine")
+    usual = tmp_path / "dask-scratch-space"
+    usual.mkdir()
+    for name in ("global.lock", "purge.lock"):
+        (usual / name).symlink_to(tmp_path / "letter.txt")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with dask_client(Engine(workers=1)) as client:
+        assert "dask-scratch-space" in client.submit(_places).result() and str(usual) not in client.submit(_places).result()
+    assert (tmp_path / "letter.txt").read_text() == "mine" and len(list(usual.iterdir())) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dask-scratch-space", "letter.txt"]
+
+
+def _places() -> str:
+    """Where a worker looks for modules."""
+    return "\n".join(sys.path)
