@@ -16,13 +16,13 @@ from ..body.shape import write_body
 from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
 from ..body.skin.facing import facing_ahead
+from ..body.skin.feet_place import with_feet_in_place
 from ..body.skin.fingers import shape_for_skin
 from ..body.skin.head_place import registered_head
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
 from ..body.skin.posed import Poser
 from ..body.skin.relief import MOST_FRAMES, SurfacePoints
-from ..body.skin.texture import TextureBaker
 from ..checking.rig_check import wide_findings
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
@@ -398,8 +398,8 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
     """
     settings: SkinSettings = run.settings["skin"]
     person = shape_for_skin(body.shape, settings)
-    skin = rest_skin(person, settings)
     points = _surface_points(run, body) if settings.relief else []
+    skin = with_feet_in_place(rest_skin(person, settings), person, points)
     if points:
         place = registered_head(skin, person, points)
         skin = with_relief(skin, person, points, place, settings.mirror, monitor)
@@ -407,7 +407,7 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
             body, skin, person = facing_ahead(body, skin, person, place.facing, run.footage.take.clicked_joints)
     write_skin(run.results.path("skin", REST), skin)
     if settings.texture_px:
-        _write_texture(run, body, TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)
+        _write_texture(run, body, texture.TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)
     rows, faces = cage(skin)
     poser, vertices = Poser(person, skin.weights[rows]), skin.vertices_m[rows]
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
@@ -418,7 +418,7 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> BodyFit:
     return body
 
 
-def _write_texture(run: Run, body: BodyFit, baker: TextureBaker, monitor: Monitor) -> None:
+def _write_texture(run: Run, body: BodyFit, baker: texture.TextureBaker, monitor: Monitor) -> None:
     """skin/texture.png from all views."""
     rows = _known_poses(body, texture.MOST_FRAMES)
     for done, row in enumerate(rows):

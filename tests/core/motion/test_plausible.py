@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tricap.core.foundation.errors import InputError
+from tricap.core.motion.plausible import MOST_FRAMES, MOST_POSES, check_span
 from tricap.core.motion.sources import read_motion_source
 
 TIMES = {"falling": (0.08, 0.04, 0.0), "equal": (0.0, 0.0, 0.0), "none": ("", "", ""), "a second last": (0.0, 0.04, 0.04)}
@@ -44,7 +45,7 @@ FAULTS = {
     "slow.trc": (trc(rate="1e-300"), "1e-300 frames per second"),
     "fast.trc": (trc(rate="inf"), "inf frames per second"),
     "slow.bvh": (bvh(time="1e300"), "1e-300 frames per second"),
-    "sparse.csv": (wide((0, 10**9, 10**9 + 1), (0, 10**9, 10**9 + 1)), "from frame 0 to 1e\\+09, with values for 3 alone"),
+    "sparse.csv": (wide((0, 10**6, 10**6 + 1), (0, 10**6, 10**6 + 1)), "from frame 0 to 1e\\+06, with values for 3 alone"),
     "far.csv": (wide(x=1e308), "positions beyond"),
     "far.trc": (trc(x=1e308), "positions beyond"),
     "far.bvh": (bvh(offset="0 1e308 0"), "positions beyond"),
@@ -65,3 +66,12 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, name: str) -> None:
 def test_what_does_not_is_read_and_exported(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
     assert read_motion_source(tmp_path / name).fps == pytest.approx(25.0)
+
+
+def test_few_keys_of_many_bones_reach_less_far() -> None:
+    check_span(0, MOST_FRAMES, 2, "It reaches", bones=MOST_POSES // MOST_FRAMES)
+    check_span(0, MOST_FRAMES, MOST_FRAMES // 100, "It reaches", bones=1000)
+    check_span(0, 10**9, 10**9, "It reaches", bones=1000)
+    for last, bones in ((MOST_FRAMES + 1, 1), (MOST_FRAMES, 150), (MOST_POSES // 150 + 1, 150)):
+        with pytest.raises(InputError, match="It reaches from frame 0 to [0-9]*, with values for 2 alone"):
+            check_span(0, last, 2, "It reaches", bones=bones)
