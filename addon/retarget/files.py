@@ -40,8 +40,11 @@ def open_rig(path: Path) -> None:
         InputError: there is no such file, its format is unknown, or Blender cannot read it.
     """
     path = bounded.real_path(path)
-    if not path.is_file():
-        raise InputError(f"{path} is a folder; choose a file." if path.is_dir() else f"There is no file {path}; check its name.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; choose a file.")
+    if not path.exists():
+        raise InputError(f"There is no file {path}; check its name.")
+    _check(path)
     kind = path.suffix.lower()
     if kind not in RIG_FILES:
         raise InputError(f"{path.name} is not a rig in a known format; choose one of {', '.join(RIG_FILES)}.")
@@ -179,10 +182,22 @@ def _rig_of_bvh(path: Path) -> None:
         bone.matrix_basis.identity()
 
 
-def _try(load: Callable[[], object], path: Path) -> None:
-    """Run an importer; any error that it raises becomes an InputError about the file."""
+def _check(path: Path) -> None:
+    """Check that an importer may open a file.
+
+    Raises:
+        InputError: it is a pipe or a device, too large, or cannot be opened.
+    """
     try:
         bounded.check_file(path, bounded.ARRAYS_BYTES)
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}; choose another file.") from error
+
+
+def _try(load: Callable[[], object], path: Path) -> None:
+    """Run an importer; any error that it raises becomes an InputError about the file."""
+    _check(path)
+    try:
         with unheard() if bpy.app.background else nullcontext():  # importers print tracebacks of their own
             load()
     except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text

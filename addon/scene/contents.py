@@ -16,13 +16,14 @@ from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.fingers import shape_for_skin
 from ...core.body.skin.mesh import SkinSettings
 from ...core.body.skin.person_skin import REST
+from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.motion.formats.ply import Ply, read_ply
 from ...core.motion.tables import JointTable, MotionTable, read_guessed, read_joints, read_motion
-from ...core.results.folder import check_complete
+from ...core.results.folder import check_complete, with_fewer_files
 from ...core.results.run_json import read_run
 from ...core.run.record import doubtful_stretches, read_frame_table
 from ...core.take.bar_file import read_bar
@@ -32,6 +33,8 @@ from ...core.tracking.settings import TrackStatus
 from .prepare import Prepared, prepare
 
 TABLES = ("body.toml", "motion.csv", "joints.csv", "frames.csv")
+SKIN = "skin"
+FOLDERS = ("clouds", SKIN)  # of results, with files that the scene shows
 DEFAULT_FPS = 25.0  # of a scene whose take is missing
 
 
@@ -101,8 +104,9 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False, removed: 
     motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
+    warnings += _fewer_files(out, run, settings)
     person = None if shape is None else shape_for_skin(shape, settings)
-    prepared = prepare(clouds, trajectories, person, motion, settings, out / "skin" / REST, monitor)
+    prepared = prepare(clouds, trajectories, person, motion, settings, out / SKIN / REST, monitor)
     return Contents(
         out=out,
         run=run,
@@ -186,6 +190,17 @@ def _skins(
         warnings.append(f"No exact skin in the scene: {error}")
         return None
     return FrameSkins(frames=motion.frames, vertices_m=np.stack(vertices), settings=settings)
+
+
+def _fewer_files(out: Path, run: Mapping[str, Any], settings: SkinSettings) -> list[str]:
+    """A sentence for each folder of results, if there is one, from which files were removed; for the skin's colours one of their own."""
+    sentences = []
+    for name in with_fewer_files(out, run, [name for name in FOLDERS if (out / name).is_dir()]):
+        said = f"{out / name} has fewer files than the run wrote there"
+        if name == SKIN and settings.texture_px and not (out / name / TEXTURE).is_file():
+            said = f"No colours on the skin in the scene: {TEXTURE} is no file in {out / name}"
+        sentences.append(f"{said}; repeat the run, which makes it again.")
+    return sentences
 
 
 def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list[str]) -> Any:

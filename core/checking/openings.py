@@ -12,6 +12,7 @@ from ..take.footage import Footage
 from ..take.person_masks import check_mask, silhouette_files, silhouettes
 from ..take.sources import KeypointSource, read_picture
 from .findings import Cause, Finding, doubtful, wrong
+from .places import place_findings
 from .survey import LONGEST
 
 LAST_IMAGES = 50  # of a view; with a clock, not every one of them is that of a frame
@@ -32,7 +33,7 @@ def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -
         except InputError as error:
             if str(error) not in [finding.sentence for finding in findings]:
                 findings.append(wrong(Cause.INPUT, str(error)))
-    return findings
+    return findings or place_findings(footage, fitting, monitor)
 
 
 def _keypoint_doubts(footage: Footage, source: KeypointSource) -> list[Finding]:

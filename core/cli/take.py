@@ -9,6 +9,7 @@ from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..images.sequence import movie_rate, open_sequence
+from ..results.folder import check_no_root
 from ..take.bar_file import read_bar, write_bar
 from ..take.take import START_ALONE
 from ..take.writing import ASSUMED_FPS, footage_entry, make_take, new_table, take_of_table
@@ -20,6 +21,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Everything is checked before the first file is written.
     """
     folder: Path = args.take
+    check_no_root(folder)
     if (folder / "take.toml").exists():
         raise InputError(f"{folder} is a take already; choose another folder.")
     views = [tuple(v.split("=", 1)) for v in args.views]
@@ -34,8 +36,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     fps = args.fps if args.fps is not None else next(iter(stated), ASSUMED_FPS)
     table = new_table(entries, fps=fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
-    if take.joints_model and not take.joints_model.endswith(".toml"):  # a user's own model may be copied into the folder later
-        read_model(take.joints_model)
+    if take.joints_model:
+        _check_model(take.joints_model)
     rig = read_any(args.rig) if args.rig else None
     cameras = [camera.name for camera in rig.cameras] if rig else []
     if rig and (unknown := [view.name for view in take.views if view.name not in cameras]):
@@ -54,6 +56,19 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.fps is None and not stated:
         lines.append(f"The footage states no frame rate, so {fps:g} is assumed; if it is another, correct `fps` in {folder / 'take.toml'}.")
     return lines
+
+
+def _check_model(model: str) -> None:
+    """Check the body model of a take: one of ours by its name, or the path of the take's own.
+
+    Raises:
+        InputError: there is none, or it is faulty.
+    """
+    if model.endswith(".toml") and not Path(model).exists():
+        raise InputError(
+            f"The body model {model} is missing; copy it into that folder first, or leave --model out and write it under [body] later."
+        )
+    read_model(model)
 
 
 def _check_size(name: str, source: Path, size_px: tuple[int, int]) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import struct
 import zlib
 from datetime import date, time
@@ -11,16 +12,19 @@ NO_THREAD = "can't start new thread"  # what Python says where the limit of memo
 NO_ROOM = ("failed to map segment", "Cannot allocate memory")  # what the system's loader says of a library for which there is no memory
 LONGEST = 1500  # characters of a message
 LONGEST_VALUE = 80  # and of a value that it quotes
+LONGEST_REASON = 200  # and of what Python says of such a value
+QUOTED = re.compile(rf"“([^“”]{{{LONGEST_VALUE}}})[^“”]{{{LONGEST_VALUE // 4},}}”")
 
 
 class InputError(Exception):
     """The input is faulty. The message is one sentence: what is wrong, which input it is, and what to do.
 
-    Quotations from damaged files are made safe for a terminal: no control characters, no endless lines.
+    Quotations from damaged files are made safe for a terminal: no control characters, no endless lines or quotations.
     """
 
     def __init__(self, message: str = "") -> None:
         text = "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in str(message))
+        text = QUOTED.sub(r"“\1 …”", text)
         super().__init__(text if len(text) <= LONGEST else text[: LONGEST // 2] + " … " + text[-LONGEST // 2 :])
 
 
@@ -44,7 +48,10 @@ def damage_of(error: Exception) -> str:
         return "it ends too early"
     if isinstance(error, zlib.error):
         return "what is packed in it cannot be unpacked"
-    return str(error) if isinstance(error, (InputError, ValueError, csv.Error)) else "an entry is missing or of a wrong kind"
+    if isinstance(error, (ValueError, csv.Error)):
+        reason = str(error)
+        return reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]} …"
+    return str(error) if isinstance(error, InputError) else "an entry is missing or of a wrong kind"
 
 
 def with_notes(error: BaseException) -> str:

@@ -55,8 +55,10 @@ def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable
     """Refuse to mix results with footage, because one could replace the other. `footage`: all its files.
 
     Raises:
-        InputError: OUT is a take, contains its footage or lies among its images, or take or footage lie where results are replaced.
+        InputError: OUT is a take, contains its footage or lies among its images, is the root of a drive, or take or footage lie where
+            results are replaced.
     """
+    check_no_root(out)
     where = bounded.real_path(out)
     advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
     if (where / "take.toml").exists():
@@ -70,6 +72,17 @@ def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable
             raise InputError(f"The footage {path} is inside {out}, where a run replaces files; choose another folder for the results.")
     if take is not None and any(bounded.real_path(take).is_relative_to(place) for place in replaced):
         raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
+
+
+def check_no_root(folder: Path) -> None:
+    """Refuse the root of a drive as a folder for files of ours.
+
+    Raises:
+        InputError: it is one.
+    """
+    where = bounded.real_path(folder)
+    if where == where.parent:
+        raise InputError(f"{folder} is the root of a drive; choose a folder on it, such as {where / 'results'}.")
 
 
 def _folders_of(footage: Iterable[Path]) -> list[tuple[Path, frozenset[Path]]]:
@@ -105,6 +118,7 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = bounded.real_path(folder)
+        check_no_root(folder)
         bounded.check_name(self.folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
@@ -232,6 +246,12 @@ def lost(folder: Path, run: Mapping[str, Any], among: Iterable[str] | None = Non
         if less:
             found[stage] = less
     return found
+
+
+def with_fewer_files(folder: Path, run: Mapping[str, Any], among: Iterable[str]) -> list[str]:
+    """The folders of results, among some, that have fewer files than when run.json was written."""
+    then = run.get("files", {})
+    return [name for name in among if name in then and _size(folder / name)[0] < then[name][0]]
 
 
 def check_complete(folder: Path, names: Iterable[str]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..images.sequence import IMAGE_ENDINGS
+from .folder import check_no_root
 
 LIST = bounded.LISTED_FILES
 PICTURES = tuple(f"*{ending}" for ending in IMAGE_ENDINGS)
@@ -20,8 +21,9 @@ def check_files(folder: Path, patterns: Sequence[str]) -> None:
     """Check that a folder, if there is one, has no files of some kinds but those that an earlier call wrote.
 
     Raises:
-        InputError: it has.
+        InputError: it has, or it is the root of a drive.
     """
+    check_no_root(folder)
     ours = _listed(folder)
     for name in sorted(path.name for path in folder.iterdir()) if folder.is_dir() else ():
         if name not in ours and _is_of(name, patterns):

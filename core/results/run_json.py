@@ -23,6 +23,7 @@ SEEN = {"full": "the whole person is seen", "upper_body": "the images cut the pe
 JOINTS = "it has the joints that are located"
 STAGE_WORDS = ("key", "content", "stamped", "not_done", "chosen_model", "surface")
 LARGEST_FIGURE = 1e12  # far above every figure of a run
+MOST_FRAMES = 10_000_000  # of a run
 
 
 def read_run(path: Path) -> dict[str, Any]:
@@ -59,8 +60,7 @@ def _invalid_table(run: Mapping[str, Any]) -> str | None:
         return "settings"
     if not bounded.is_path(run.get("take", "")):
         return "take"
-    frames = run.get("frames", [0, 0])
-    if len(frames) != 2 or any(type(f) is not int for f in frames) or not 0 <= frames[1] - frames[0]:
+    if not _is_span(run.get("frames", [0, 0])):
         return "frames"
     sizes = run.get("files", {}).values()
     if any(not isinstance(size, list) or len(size) != 2 or any(type(n) is not int for n in size) for size in sizes):
@@ -89,11 +89,18 @@ def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
         ):
             return stage
         again = entry.get("fitted_again", []) if stage == "fit" else []
-        if not isinstance(again, list) or any(not isinstance(ends, list) or [type(f) for f in ends] != [int, int] for ends in again):
+        if not isinstance(again, list) or not all(map(_is_span, again)):
             return stage
         if not isinstance(entry.get("fitted_with", {}), dict):
             return stage
     return None
+
+
+def _is_span(value: Any) -> bool:
+    """Whether a value is a first and a last frame, or the one after it, not too far apart for a run."""
+    if not isinstance(value, list) or [type(frame) for frame in value] != [int, int]:
+        return False
+    return 0 <= value[1] - value[0] <= MOST_FRAMES and abs(value[0]) < LARGEST_FIGURE
 
 
 def is_figure(value: Any) -> bool:

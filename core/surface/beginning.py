@@ -49,7 +49,7 @@ def other_beginning(footage: Footage, settings: MeasureSettings, results: Result
     usual = Beginning(frame=first, points=points, pairs=settings.growing.pairs)
     if no_view_alike(footage.rig.cameras, footage.take.reference):
         return usual if points else None
-    frames = _others(footage, settings, first)
+    frames = other_frames(footage, first, automatic_seeds=settings.growing.seed_spacing_px > 0)
     can_pair = len(degrees) > 1 and degrees[1] <= WIDEST_DEG and not settings.growing.pairs
     parts = len(frames) + can_pair * (1 + len(frames))
     tried = [_tried(footage, settings, results, frame, monitor.part("surface", i, parts)) for i, frame in enumerate(frames)]
@@ -65,9 +65,9 @@ def other_beginning(footage: Footage, settings: MeasureSettings, results: Result
     return best if best.points else None
 
 
-def _others(footage: Footage, settings: MeasureSettings, first: int) -> list[int]:
+def other_frames(footage: Footage, first: int, *, automatic_seeds: bool) -> list[int]:
     """Frames spread over the take, of both fields those on the rows of the first; none where seeds are clicked in the first frame only."""
-    if not settings.growing.seed_spacing_px:
+    if not automatic_seeds:
         return []
     alike = np.array(footage.frames)[(np.array(footage.frames) - first) % footage.take.field_layout.per_image == 0]
     some = alike[np.unique(np.linspace(0, len(alike) - 1, OTHERS + 1).round().astype(int))]

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..body.shape import read_body
 from ..foundation import bounded, store
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, damage_of
 from ..foundation.progress import Monitor
 from ..motion.formats.ply import Ply, read_ply
 from .truth import Truth, motion_capture_name, read_truth
@@ -237,7 +237,7 @@ def _table(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
     try:
         rows = list(csv.reader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read {path}: {error}; run the fit again.") from error
+        raise InputError(f"Cannot read {path}: {damage_of(error)}; run the fit again.") from error
     missing = [name for name in needed if not rows or name not in rows[0]]
     if missing or any(len(row) != len(rows[0]) for row in rows):
         raise InputError(f"{path} is no complete table with the columns {', '.join(needed)}; run the fit again.")

@@ -17,6 +17,7 @@ from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..geometry.rig import Rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
+from .bar_file import bar_path
 from .take import FORMAT, VERSION, Take, take_of_text
 
 Link = tuple[Path, Path]  # its path in the take's folder, and the footage that it leads to
@@ -24,6 +25,7 @@ Table = dict[str, Any]
 DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # that a file may leave out
 STRING = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'')
 MOST_COPIES = 99
+OWN_NAMES = ("take.toml", "take.toml.bak", "rig.toml", bar_path(Path("rig.toml")).name, "fields")  # of files and folders of a take
 COPIED = " The file with your comments was copied beside it (*.bak)."
 ASSUMED_FPS = 25.0  # of footage that states no frame rate, where nobody says it either
 
@@ -127,8 +129,10 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
     """The entry of [[views]] for footage, a movie or a folder of images, and the link into the take's folder that it needs.
 
     Raises:
-        InputError: the footage is missing, holds the folder, or another file has its name in the folder.
+        InputError: the footage is missing, holds the folder, or another file has its name in the folder, or may get it.
     """
+    if name.casefold() in OWN_NAMES:
+        raise InputError(f"A view cannot be named “{name}”, as a file of the take itself is; choose another name for it, such as C.")
     if not source.exists():
         whole = f" (for a pattern give its folder, {source.parent})" if "*" in source.name else ""
         raise InputError(f"The footage {source} of view {name} is missing; check the path{whole}.")

@@ -19,6 +19,7 @@ from .settings import TrackingSettings, TrackStatus
 from .trajectories import Filtered, Trajectories, filter_trajectories, picked
 
 SMALLEST_PX2 = 1.0  # of the image in a region
+RIM_PX = 2.0  # of an image, in which nothing is measured: half of the smallest patch
 CLICK_REACH_PX = 5.0  # distance from a click to the trajectory that it means
 
 
@@ -72,11 +73,17 @@ def without(filtered: Filtered, source: int) -> Filtered:
 
 def corrected_cloud(cloud: PointCloud, corrections: Sequence[Correction], rig: Rig) -> PointCloud:
     """The cloud without the points inside the regions of its frame."""
-    gone = np.zeros(len(cloud.xyz_m), dtype=bool)
-    for c in corrections:
-        if c.kind == "region" and cloud.frame in c.frames:
-            gone |= inside_polygon(rig[c.view].project(cloud.xyz_m), c.xy_px)
+    gone = in_regions(cloud.xyz_m, cloud.frame, corrections, rig)
     return cloud.select(~gone) if gone.any() else cloud
+
+
+def in_regions(xyz_m: np.ndarray, frame: int, corrections: Sequence[Correction], rig: Rig) -> np.ndarray:
+    """(N,) the points (N, 3) inside the regions of a frame."""
+    inside = np.zeros(len(xyz_m), dtype=bool)
+    for c in corrections:
+        if c.kind == "region" and frame in c.frames:
+            inside |= inside_polygon(rig[c.view].project(xyz_m), c.xy_px)
+    return inside
 
 
 def corrected_tracks(
@@ -101,22 +108,51 @@ def corrected_tracks(
 
 
 def odd_regions(corrections: Sequence[Correction], rig: Rig) -> list[str]:
-    """A sentence for each region that has nothing of its view's image in it, or all of it."""
+    """A sentence for each region that has nothing of its view's image in it, or all of it; and for regions that have all of it together."""
     sentences = []
-    for c in (c for c in corrections if c.kind == "region"):
-        place = f"The corrected region at ({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view}"
-        if _enclosed_px2(c.xy_px, rig[c.view]) < SMALLEST_PX2:
-            sentences.append(f"{place} encloses nothing of the image; draw it again or remove it.")
-        elif inside_polygon(_places(rig[c.view]), c.xy_px).all():
-            frames = f"frame {c.frames[0]}" if len(c.frames) == 1 else f"frames {c.frames[0]} to {c.frames[-1]}"
-            sentences.append(f"{place} encloses the whole image, so that no points remain in {frames}; draw it again or remove it.")
+    regions = [c for c in corrections if c.kind == "region"]
+    for view in dict.fromkeys(c.view for c in regions):
+        camera, parts = rig[view], list[tuple[Correction, np.ndarray]]()
+        for c in (c for c in regions if c.view == view):
+            place, inside = f"The corrected region at ({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {view}", _enclosed(camera, c.xy_px)
+            if _enclosed_px2(c.xy_px, camera) < SMALLEST_PX2:
+                sentences.append(f"{place} encloses nothing of the image; draw it again or remove it.")
+            elif inside.all():
+                where = _named(c.frames)
+                sentences.append(f"{place} encloses the whole image, so that no points remain in {where}; draw it again or remove it.")
+            else:
+                parts.append((c, inside))
+        if (frames := _covered(parts)) is not None:
+            together = f"The corrected regions of view {view} together enclose the whole image"
+            sentences.append(f"{together}, so that no points remain in {_named(frames)}; draw them again or remove some.")
     return sentences
 
 
-def _places(camera: Camera) -> np.ndarray:
-    """Pixels (N, 2) all over an image."""
-    x, y = (np.linspace(0, size - 1, 40) for size in camera.size_px)
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+def _named(frames: range) -> str:
+    return f"frame {frames[0]}" if len(frames) == 1 else f"frames {frames[0]} to {frames[-1]}"
+
+
+def _covered(parts: Sequence[tuple[Correction, np.ndarray]]) -> range | None:
+    """The first frames in which regions, with the places (N,) of an image inside each, have all of these together; None without any."""
+    changes = sorted(
+        [(c.frames.start, 1, inside) for c, inside in parts] + [(c.frames.stop, -1, inside) for c, inside in parts], key=_first
+    )
+    count = np.zeros(len(parts[0][1]) if parts else 0, dtype=int)
+    for n, (frame, sign, inside) in enumerate(changes[:-1]):
+        count += sign * inside
+        if changes[n + 1][0] > frame and (count > 0).all():
+            return range(frame, changes[n + 1][0])
+    return None
+
+
+def _first(change: tuple[int, int, np.ndarray]) -> int:
+    return change[0]
+
+
+def _enclosed(camera: Camera, polygon: np.ndarray) -> np.ndarray:
+    """Which of the places (N,) all over an image, as far as points are measured, are inside a polygon (V, 2)."""
+    x, y = (np.linspace(min(RIM_PX, (size - 1) / 2), max(size - 1 - RIM_PX, (size - 1) / 2), 40) for size in camera.size_px)
+    return inside_polygon(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), polygon)
 
 
 def _enclosed_px2(polygon: np.ndarray, camera: Camera) -> float:

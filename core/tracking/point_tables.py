@@ -11,7 +11,7 @@ import numpy as np
 
 from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse
-from ..foundation.errors import InputError, damage_of
+from ..foundation.errors import InputError, damage_of, shown
 from ..foundation.settings import nearest_name
 from ..geometry.camera import Camera
 from ..images.interlace import frame_time_s
@@ -77,7 +77,7 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"Line {line} of {path} has {column} = {text!r}; write a pixel coordinate, with a point for decimals.")
+        raise InputError(f"Line {line} of {path} has {column} = {shown(text)}; write a pixel coordinate, with a point for decimals.")
     return value
 
 
@@ -207,8 +207,10 @@ def read_polygon(path: Path) -> np.ndarray:
     """
     try:
         rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"Cannot read the polygon {path}: {error}.") from error
+    except OSError as error:
+        raise InputError(f"Cannot read the polygon {path}: {error.strerror or error}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} is not a CSV table ({damage_of(error)}); save it as CSV in UTF-8.") from error
     if len(rows) < 3 or not {"x", "y"} <= set(rows[0]):
         raise InputError(f"{path} is not a polygon; write a line x,y and three or more lines of pixel coordinates.")
     if len(rows) > MOST_CORNERS:

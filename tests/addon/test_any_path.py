@@ -45,6 +45,25 @@ def test_operators_with_paths_that_are_none(blender: ModuleType, small_run: Smal
     assert len(refused) > 15
 
 
+@pytest.mark.parametrize("ending", [".blend", ".glb", ".vrm", ".fbx", ".bvh"])
+def test_a_rig_that_cannot_be_opened_is_told_in_plain_words(
+    blender: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    from tricap.addon.retarget import files
+    from tricap.core.foundation.errors import InputError
+
+    (tmp_path / f"large{ending}").write_bytes(b"x" * 2000)
+    monkeypatch.setattr(files.bounded, "ARRAYS_BYTES", 1000)
+    cases = {"large": "Cannot read .*large.*: it is larger than 0 MB, .*; choose another file", "none": "There is no file .*none"}
+    if os.name == "posix":
+        os.mkfifo(tmp_path / f"pipe{ending}")
+        cases["pipe"] = "Cannot read .*pipe.*: it is a device, a pipe or a socket, not a file; choose another file"
+    for name, said in cases.items():
+        with pytest.raises(InputError, match=said) as refused:
+            files.open_rig(tmp_path / f"{name}{ending}")
+        assert "Errno" not in str(refused.value)
+
+
 @pytest.mark.slow
 def test_fifty_steps_back_and_forth(blender: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """The results, the frame and the panel's settings go with the steps, and everything works afterwards."""

@@ -9,11 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from tricap.__main__ import main
+from tricap.core.body.skin.texture import TEXTURE
 from tricap.core.foundation.errors import InputError
+from tricap.core.results.folder import Results
 
 from .conftest import FPS, FRAMES, SmallRun
 
@@ -156,6 +159,35 @@ def test_what_is_missing_is_left_out_and_said(empty: ModuleType, small_run: Smal
     report = build_scene(small_run.out)
     assert [warning for warning in report.warnings if said in warning]
     assert report.counts["cameras"] == 3
+
+
+@pytest.mark.parametrize(("gone", "said"), [
+    ("skin/texture.png", "No colours on the skin in the scene: texture.png is no file in {out}/skin; repeat the run"),
+    ("skin/0002.ply", "{out}/skin has fewer files than the run wrote there; repeat the run"),
+    ("clouds/0003.ply", "{out}/clouds has fewer files than the run wrote there; repeat the run"),
+])  # fmt: skip
+def test_a_file_of_a_folder_that_is_gone_is_said(empty: ModuleType, small_run: SmallRun, gone: str, said: str) -> None:
+    """Also where a pipe is in its place, which nobody opens."""
+    from tricap.addon.scene.build import build_scene
+
+    (small_run.out / "skin" / TEXTURE).write_bytes(cv2.imencode(".png", np.full((16, 16, 3), 200, np.uint8))[1].tobytes())
+    results = Results(small_run.out)
+    results.write_run(results.read_run())
+    assert build_scene(small_run.out).warnings == ()
+    (small_run.out / gone).unlink()
+    said = said.replace("{out}/", f"{small_run.out}{os.sep}")
+    assert [w.startswith(said) for w in build_scene(small_run.out).warnings] == [True]
+    if hasattr(os, "mkfifo") and "clouds" not in gone:  # a cloud is read, and refused
+        os.mkfifo(small_run.out / gone)
+        assert [w.startswith(said) for w in build_scene(small_run.out).warnings] == [True]
+
+
+def test_a_skin_without_a_texture_is_as_it_was_wanted(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    results = Results(small_run.out)
+    results.write_run({**results.read_run(), "settings": {"skin": {"texture_px": 0}}})
+    assert build_scene(small_run.out).warnings == ()
 
 
 def test_a_take_that_was_moved_costs_only_cameras_and_footage(empty: ModuleType, small_run: SmallRun) -> None:

@@ -150,7 +150,7 @@ def find_background(
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
     sizes = _cell_sizes(footage, clouds, chosen)
     known = {k: b for k, b in enumerate(_backgrounds(footage, clouds, chosen, sizes, monitor, bodies)) if b is not None}
-    masked = {k for k in range(len(sizes)) if _has_silhouettes(footage, k)}
+    masked = {k for k in range(len(sizes)) if has_silhouettes(footage, k)}
     if not known and not masked:
         return []
     limits = {k: cells(_mask_of(footage, k, int(frames[0])), sizes[k]) > 0 for k in known if footage.take.views[k].mask is not None}
@@ -193,7 +193,7 @@ def find_background(
     ]
 
 
-def _has_silhouettes(footage: Footage, k: int) -> bool:
+def has_silhouettes(footage: Footage, k: int) -> bool:
     """Whether the masks of a view are the person's silhouettes: one for all of many images only says where the person moves."""
     view = footage.take.views[k]
     return view.masks is not None or (view.mask is not None and footage.sequences[k].count == 1)
@@ -234,7 +234,7 @@ def _backgrounds(
 
     def background(k: int) -> CellBackground | None:
         camera, view, size = footage.rig.cameras[k], footage.take.views[k], sizes[k]
-        if view.background is None and (_has_silhouettes(footage, k) or len(chosen) < FEWEST):
+        if view.background is None and (has_silhouettes(footage, k) or len(chosen) < FEWEST):
             return None
         images = []
         for frame in numbers:

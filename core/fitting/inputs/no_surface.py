@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 
 from ...foundation.progress import Monitor
+from ...images.foreground import FEWEST
 from ...results.folder import Results
 from ...surface.cloud import PointCloud
 from ...take.footage import Footage
 from ...tracking.contour import ContourTable, Polygons
 from ...tracking.image_points import ImageStep, followed
 from ..settings import FitSettings
-from .background import UNIT_PX, find_background, near_points
+from .background import UNIT_PX, find_background, has_silhouettes, near_points
 from .fit_input import BackgroundDistances, Packed
 
 STEP_PX = 4  # of the distances from outlines
@@ -27,6 +28,12 @@ SUBPIXEL_BITS = 4  # of a polygon's vertices in OpenCV's fixed-point coordinates
 def can_fit_without_surface(footage: Footage, results: Results) -> bool:
     """Whether there are outlines (`tricap contour`) or keypoints for a fit without measured points."""
     return bool(footage.take.keypoints) or any(results.path("contours", f"{v.name}.csv").is_file() for v in footage.take.views)
+
+
+def can_show_outlines(footage: Footage, settings: FitSettings) -> bool:
+    """Whether the images may show outlines of the person for a fit: by masks or a background of the user's, or in enough frames."""
+    given = any(view.background is not None or has_silhouettes(footage, k) for k, view in enumerate(footage.take.views))
+    return settings.use_background and (given or len(footage.frames) >= FEWEST)
 
 
 def empty_clouds(footage: Footage) -> list[PointCloud]:

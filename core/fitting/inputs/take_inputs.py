@@ -1,6 +1,6 @@
 """The fit's input from a take and its run: clicks and limits of take.toml, clouds and trajectories, contours/*.csv in OUT, keypoints."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...body.model_file import read_model, with_limits
+from ...body.trunk import suffice_for_pose
 from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...foundation.settings import nearest_name
@@ -19,7 +20,7 @@ from ...motion.retarget.points import joint_of
 from ...results.folder import Results
 from ...take.footage import Footage, footage_frames
 from ...take.sources import KeypointSource
-from ...take.take import JOINTS, START_ALONE, FrameClicks, Take
+from ...take.take import AUTO_BODY, JOINTS, START_ALONE, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
@@ -94,8 +95,48 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
         check_apart({name: views for name, views in at.items() if name in names}, frame)
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if places and not take.keypoints and take.body_model not in START_ALONE:
-        best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
-        initial_clicks(places.get(take.clicks.frame, places[best]), names, [])
+        initial_clicks(places[_first_clicked(take, places)], names, [])
+
+
+def _first_clicked(take: Take, places: Mapping[int, np.ndarray]) -> int:
+    """The frame of clicks, with places (J, 3) of joints, where a fit begins: that of [seeds], or else the one with most joints."""
+    best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
+    return take.clicks.frame if take.clicks.frame in places else best
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ClickedBody:
+    """A body in the frame of its clicks: the places (3,) of its joints, NaN of those that are not clicked in two views, and the joints of
+    each bone. `begins`: the fit begins there, and not where somebody is found without clicks."""
+
+    frame: int
+    places_m: Mapping[str, np.ndarray]
+    bones: tuple[tuple[str, str], ...]
+    begins: bool
+
+
+def clicked_body(footage: Footage, settings: FitSettings) -> ClickedBody | None:
+    """The clicked body of a take without keypoints; None where no body is wanted, or no joint has a place.
+
+    Raises:
+        InputError: clicks contradict each other, or the model has an error.
+    """
+    take, clicks = footage.take, clicks_in(footage)
+    if take.joints_model is None or take.keypoints or not clicks:
+        return None
+    skeleton = read_model(take.joints_model).skeleton
+    names = skeleton.joint_names
+    places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
+    located = [{name for name, place in zip(names, xyz) if np.isfinite(place).all()} for xyz in places.values()]
+    frame = _first_clicked(take, places)
+    if not np.isfinite(places[frame]).any():
+        return None
+    return ClickedBody(
+        frame=frame,
+        places_m=dict(zip(names, places[frame])),
+        bones=tuple((bone.head_joint, bone.tail_joint) for bone in skeleton.bones),
+        begins=take.body_model != AUTO_BODY and any(suffice_for_pose(joints, skeleton) for joints in located),
+    )
 
 
 def missing_for_fit(footage: Footage) -> str:

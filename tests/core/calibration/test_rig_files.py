@@ -410,6 +410,13 @@ def test_broken_files_are_refused_with_a_sentence(name: str, text: str, tmp_path
         read_any(tmp_path / name)
 
 
+def test_a_name_of_a_megabyte_is_not_said_in_full(tmp_path: Path) -> None:
+    (tmp_path / "rig.yml").write_text(f"%YAML:1.0\nnames: [ {'x' * 10**6} ]\n")
+    with pytest.raises(InputError, match="lacks the matrix “camera_matrix_x") as refused:
+        read_any(tmp_path / "rig.yml")
+    assert len(str(refused.value)) < 250 + len(str(tmp_path))
+
+
 def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rig.xml").write_text('<!DOCTYPE a [<!ENTITY b "c">]><document>&b;</document>')
     with pytest.raises(InputError, match="entities"):

@@ -15,15 +15,17 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import MODELS
 from tricap.core.calibration.rig_files import write_as
 from tricap.core.cli import main, stages
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Course, Monitor
 from tricap.core.geometry.rig import read_rig
+from tricap.core.results.folder import FIELDS
 from tricap.core.run import pipeline
 from tricap.core.run.settings import SETTINGS
 from tricap.core.take import writing
-from tricap.core.take.bar_file import read_bar, write_bar
+from tricap.core.take.bar_file import bar_path, read_bar, write_bar
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 
@@ -453,6 +455,11 @@ NEW_FAULTS = {
     "fps 0": (["L={t}/L", "C={t}/C"], ["--fps", "0"], "`fps` of"),
     "rig missing": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/none.toml"], "none.toml is missing"),
     "rig of others": (["L={t}/L", "X={t}/C"], ["--rig", "{t}/rig.toml"], "has no camera “X”, but L, C, R"),
+    "named take.toml": (["take.toml={t}/L", "C={t}/C"], [], "cannot be named “take.toml”"),
+    "named rig.toml": (["Rig.TOML={t}/L", "C={t}/C"], ["--rig", "{t}/rig.toml"], "cannot be named “Rig.TOML”, as a file of the take"),
+    "named as the bar": (["rig_bar.csv={t}/L", "C={t}/C"], [], "cannot be named “rig_bar.csv”"),
+    "named as the fields": (["Fields={t}/L", "C={t}/C"], [], "cannot be named “Fields”"),
+    "model missing": (["L={t}/L", "C={t}/C"], ["--model", "mine.toml"], "made/mine.toml is missing; copy it into that folder first"),
     "rig is none": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/L/0000.png"], "is of no known kind"),
 }
 
@@ -465,6 +472,28 @@ def test_new_checks_everything_before_it_makes_a_file(take: Path, tmp_path: Path
     printed = capfd.readouterr()
     assert said in printed.err and printed.err.count("\n") == 1
     assert not (tmp_path / "made").exists()
+
+
+def test_the_names_that_views_cannot_have_are_those_of_the_takes_files() -> None:
+    assert {FIELDS, "take.toml", bar_path(Path("rig.toml")).name} < {*writing.OWN_NAMES}
+    assert [name for name in writing.OWN_NAMES if name != name.casefold()] == []
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("x", "cannot be read"),
+    ('format = "tricap-model"\nversion = 1\n', "lacks an entry or has a wrong value"),
+    ("# " + "x" * (4 << 20), "it is larger than 4 MB"),
+])  # fmt: skip
+def test_new_reads_a_model_that_lies_in_the_folder(take: Path, tmp_path: Path, capfd: Capture, text: str, said: str) -> None:
+    made = tmp_path / "made"
+    made.mkdir()
+    argv = ["new", str(made), "--views", *(f"{v}={take / v}" for v in "LCR"), "--model", "mine.toml"]
+    (made / "mine.toml").write_text(text)
+    assert main.main(argv) == 2 and [p.name for p in made.iterdir()] == ["mine.toml"]
+    printed = capfd.readouterr().err
+    assert "mine.toml" in printed and said in printed and printed.count("\n") == 1
+    shutil.copy(MODELS / "arm.R.toml", made / "mine.toml")
+    assert main.main(argv) == 0 and read_take(made).joints_model == str(made / "mine.toml")
 
 
 def test_new_does_not_touch_what_is_there(take: Path, tmp_path: Path, capfd: Capture) -> None:

@@ -1,6 +1,8 @@
 """`tricap contour` on a plane before a calm background."""
 
 import csv
+import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -194,3 +196,20 @@ def test_a_polygon_that_is_none_of_a_person_is_refused_at_once(
     (tmp_path / "p.csv").write_text("x,y\n" + corners)
     argv = ["contour", str(take), "--view", "C", "--polygon", str(tmp_path / "p.csv"), "--out", str(tmp_path / "out"), "--quiet"]
     assert main(argv) == 2 and said in capfd.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("put", "said"), [
+    (lambda path: None, "p.csv: No such file or directory."),
+    (lambda path: path.mkdir(), "p.csv: it is a folder."),
+    (lambda path: path.write_bytes(b"x,y\n\xff,1\n"), "p.csv is not a CSV table (it is not text in UTF-8); save it as CSV in UTF-8."),
+    *([(os.mkfifo, "p.csv: it is a device, a pipe or a socket, not a file.")] if os.name != "nt" else []),
+])  # fmt: skip
+def test_a_polygon_that_cannot_be_read_is_told_in_plain_words(
+    tmp_path: Path, scenes: Any, capfd: pytest.CaptureFixture[str], put: Callable[[Path], Any], said: str
+) -> None:
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(width=96, height=72), [[]] * 2, noise=0.0)
+    put(tmp_path / "p.csv")
+    argv = ["contour", str(take), "--view", "C", "--polygon", str(tmp_path / "p.csv"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(argv) == 2
+    printed = capfd.readouterr().err
+    assert said in printed and "Errno" not in printed and printed.count("\n") == 1

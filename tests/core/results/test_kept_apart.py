@@ -53,6 +53,25 @@ def test_results_go_into_no_take(take: Path, tmp_path: Path, capfd: Capture, com
     assert "is itself a take; choose a separate folder for the results, such as " in refused(argv, capfd) and names(tmp_path) == before
 
 
+@pytest.mark.parametrize("command", [*WRITERS, "compare", "new", "board", "rig"])
+def test_the_root_of_a_drive_is_no_folder_for_results(take: Path, tmp_path: Path, capfd: Capture, command: str) -> None:
+    """Also by a link."""
+    (tmp_path / "points.csv").write_text("point,view,x,y\na,L,60,60\na,C,60,60\n")
+    root = Path(tmp_path.anchor)
+    more = {
+        "compare": ["compare", "{t}", "--out", "{o}"], "new": ["new", "{o}", "--views", "L={t}/L", "C={t}/C"],
+        "rig": ["calibrate", "--import", "{t}/rig.toml", "--export", "colmap", "--out", "{o}"],
+        "board": ["calibrate", "{t}", "--bar-length", "0.6", "--out", "{t}/new.toml", "--report", "{o}"],
+    }  # fmt: skip
+    places = [root]
+    if os.name != "nt":
+        (tmp_path / "link").symlink_to(root)
+        places.append(tmp_path / "link")
+    for out in places:
+        argv = [a.format(t=take, o=out, p=tmp_path / "points.csv") for a in (WRITERS | more)[command]]
+        assert " is the root of a drive; choose a folder on it, such as " in refused(argv, capfd)
+
+
 @LINKS
 def test_results_go_into_no_footage_whatever_way_leads_there(take: Path, tmp_path: Path, capfd: Capture) -> None:
     (take / "R").rename(tmp_path / "films of R")

@@ -120,7 +120,8 @@ def test_run_json(tmp_path: Path) -> None:
     ("blend", [1], "blend"), ("blend", "x", "blend"),
     ("stages", {"fit": {"joint_sigma_mm": 10**18}}, "fit"), ("settings", [], "settings"), ("settings", {"skin": 3}, "settings"),
     ("warnings", [1], "warnings"), ("inputs", {"rig.toml": 5}, "inputs"), ("views", "LCR", "views"), ("take", None, "take"),
-    ("take", "a\0b", "take"), ("take", "\ud800", "take"),
+    ("take", "a\0b", "take"), ("take", "\ud800", "take"), ("frames", [0, 10**15], "frames"), ("frames", [10**15, 10**15 + 3], "frames"),
+    ("stages", {"fit": {"joint_sigma_mm": 1.0, "fitted_again": [[0, 10**15]]}}, "fit"),
 ])  # fmt: skip
 def test_a_run_json_that_no_run_wrote(tmp_path: Path, name: str, value: object, said: str) -> None:
     store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 1, name: value})

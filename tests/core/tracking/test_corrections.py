@@ -17,7 +17,7 @@ from tricap.core.run.take_run import open_run
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import Correction, read_take
-from tricap.core.tracking.corrections import corrected_cloud, corrected_tracks, inside_polygon, missed_clicks
+from tricap.core.tracking.corrections import corrected_cloud, corrected_tracks, inside_polygon, missed_clicks, odd_regions
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, filter_trajectories, with_kinematics
 
@@ -45,6 +45,28 @@ def test_inside_polygon_is_the_even_odd_rule() -> None:
             at = a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
             rule = ((((a[:, 1] > y) != (b[:, 1] > y)) & (x < at)).sum(axis=1) % 2 == 1) & np.isfinite(xy).all(axis=1)
         assert np.array_equal(inside_polygon(xy, polygon), rule) and 100 < rule.sum() < 2900
+
+
+def rectangle(x0: float, y0: float, x1: float, y1: float, frames: range = range(4)) -> Correction:
+    return Correction(kind="region", view="C", frames=frames, xy_px=np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+
+
+WHOLE = rectangle(0, 0, 399, 299)
+LEFT, RIGHT = rectangle(-5, -5, 210, 305), rectangle(200, -5, 405, 305, range(2, 9))
+
+
+@pytest.mark.parametrize(("regions", "said"), [
+    ([WHOLE], "at (0, 0) of view C encloses the whole image, so that no points remain in frames 0 to 3"),
+    ([LEFT, RIGHT], "regions of view C together enclose the whole image, so that no points remain in frames 2 to 3"),
+    ([LEFT, rectangle(200, -5, 405, 305, range(3, 4))], "together enclose the whole image, so that no points remain in frame 3"),
+    ([LEFT, rectangle(200, -5, 405, 305, range(4, 9))], ""),
+    ([LEFT, LEFT, rectangle(240, -5, 405, 305)], ""),
+    ([LEFT], ""),
+])  # fmt: skip
+def test_regions_that_leave_nothing_of_the_image_are_named(regions: list[Correction], said: str) -> None:
+    """The last row and the last column of the image lie on the polygon of `WHOLE`, and outside of it."""
+    found = odd_regions(regions, RIG)
+    assert len(found) == bool(said) and all(said in sentence for sentence in found), found
 
 
 def test_regions_away_from_the_points_cost_next_to_nothing() -> None:
