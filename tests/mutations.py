@@ -149,6 +149,25 @@ def _node(data: bytes, r: random.Random) -> bytes:
     return json.dumps(table).encode()
 
 
+def _again(data: bytes, r: random.Random) -> bytes:
+    """A list of a JSON file has its values again and again, as often as they fit."""
+    try:
+        table = json.loads(data)
+    except (ValueError, RecursionError):
+        return _lines(data, r)
+    lists: list[list[Any]] = []
+    waiting = [table]
+    while waiting and len(lists) < 5000:
+        value = waiting.pop()
+        lists += [value] if isinstance(value, list) and value else []
+        waiting += list(value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
+    if not lists:
+        return _lines(data, r)
+    longer = r.choice(lists)
+    longer *= r.choice((2, 300, max(1, (LARGEST - len(data)) // (len(json.dumps(longer)) + 2))))
+    return json.dumps(table).encode()
+
+
 def _all_different(data: bytes, r: random.Random) -> bytes:
     """Many rows like one of a table, each with numbers and names of its own: as many columns as rows, for who makes a table of them."""
     lines = data.split(b"\n")
@@ -249,7 +268,7 @@ def _sound_sums(data: bytes, r: random.Random) -> bytes:
 
 
 DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    _cut, _flip, _flip, _word, _word, _value, _value, _value, _text, _text, _key, _key, _name, _lines, _node, _node, _all_different,
+    _cut, _flip, _flip, _word, _word, _value, _value, _value, _text, _text, _key, _key, _name, _lines, _node, _node, _again, _all_different,
     _insert, _deep, _deep,
     _indented, _encoded, _spelled, _spelled, _packed, _nothing, _sound_sums)  # fmt: skip
 

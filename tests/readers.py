@@ -429,6 +429,7 @@ READERS: dict[str, tuple[Make, Read]] = {
                             lambda f: check_gltf(f / "a.gltf")),
     **{f"picture {ending[1:]}": picture(ending) for ending in (".png", ".jpg", ".tif", ".bmp", ".webp", ".pgm")},
     "picture png 16 bit colour": picture(".png", np.uint16, (24, 32, 3)),
+    "picture tif 16 bit colour": picture(".tif", np.uint16, (24, 32, 3)),
     "movie avi": movie(".avi", "MJPG"),
     "movie mp4": movie(".mp4", "mp4v"),
 }  # fmt: skip

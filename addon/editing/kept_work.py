@@ -28,9 +28,7 @@ class Work:
     @staticmethod
     def of(scene: bpy.types.Scene) -> "Work | None":
         """That with the body of an earlier build; None without one."""
-        inside = {thing for collection in built_collections(scene) for thing in collection.all_objects}
-        bodies = [body for body in standing.all_bodies(scene) if body in inside]
-        body = next((body for body in bodies if built.is_own(body)), bodies[0] if bodies else None)
+        body = _built_body(scene)
         if body is None:
             return None
         path = standing.path_of(scene)
@@ -45,7 +43,7 @@ class Work:
 
     def again(self, scene: bpy.types.Scene, edited: Sequence[bpy.types.Action]) -> Iterator[tuple[str, str]]:
         """Do it again with the body that was built in its place; gives sentences, each with its kind. `edited`: actions that are kept."""
-        body, played = next(standing.all_bodies(scene), None), set[bpy.types.Action]()
+        body, played = _built_body(scene), set[bpy.types.Action]()
         if body is not None:
             body.location.xy, body.rotation_euler, body.scale = self.location.xy, self.rotation, self.scale
             if self.path != standing.Path.BONE:
@@ -81,3 +79,10 @@ class Work:
         played |= base
         layers = any(built.is_edited(action) for action in base)
         return "INFO", f"The control rig “{rig.name}” plays the new motion{', with your corrections over it' if layers else ''}."
+
+
+def _built_body(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The body of a build, not a copy of it; None without one."""
+    inside = {thing for collection in built_collections(scene) for thing in collection.all_objects}
+    bodies = [body for body in standing.all_bodies(scene) if body in inside]
+    return next((body for body in bodies if built.is_own(body)), bodies[0] if bodies else None)

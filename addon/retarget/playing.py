@@ -22,9 +22,8 @@ from ...core.motion.plausible import check_span
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.results.listed_files import PLY, check_files, list_files
 from ..scene import layers, stored
-from ..scene.action_curves import curves_of
 from ..scene.armature import JOINTS_KEY
-from .read import action_frames, check_plays, read_rig, reading_motion
+from .read import action_frames, check_plays, frames_with_keys, read_rig, reading_motion
 
 RIGID = "Tricap rigid"  # the modifier of the copy of a mesh whose parent is a bone
 
@@ -45,8 +44,8 @@ def exported_frames(scene: bpy.types.Scene) -> range:
     frames = played_frames(scene)
     if not frames:
         raise InputError(f"The scene ends in frame {scene.frame_end}, before it begins; correct its frame range.")
-    keys = sum(len(curve.keyframe_points) for action in bpy.data.actions for curve in curves_of(action))
-    check_span(frames[0], frames[-1], keys, "The scene plays")
+    bones = max((len(o.data.bones) for o in scene.objects if o.type == "ARMATURE"), default=0)
+    check_span(frames[0], frames[-1], frames_with_keys(bpy.data.actions), "The scene plays", bones=bones)
     return frames
 
 

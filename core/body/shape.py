@@ -35,6 +35,7 @@ LARGEST_STEP = 0.2  # of ln l
 LEAST_F = 1e-6  # bounds of F, so that its logarithm …
 MOST_F = 0.99
 LEAST_ROOT_SQUARED = 0.03  # … and the derivative of the root stay finite
+MOST_BONES, MOST_BALLS = 500, 2000  # of a body: ten times as many as a person with fingers has; Blender needs the square of the time
 LAST_LINE = "# end"  # of body.toml: without it the file was cut
 LARGEST_SIGMA = 0.48  # of ln (bend − BENDS[0]) of relaxed or bent fingers, up to where they count as measured; 0.8 of its prior's
 STOUT = 0.4  # mean radius over length: bones above it belong to the trunk
@@ -172,7 +173,13 @@ class BodyShape:
 
 
 def default_shape(model: BodyModel) -> BodyShape:
-    """The model's nominal lengths and default radii, before any measurement."""
+    """The model's nominal lengths and default radii, before any measurement.
+
+    Raises:
+        InputError: it has more bones than any body.
+    """
+    if len(model.skeleton.bones) > MOST_BONES:
+        raise InputError(f"The body model “{model.name}” has {len(model.skeleton.bones)} bones, more than {MOST_BONES}; use another.")
     lengths = np.array([bone.nominal_length_m for bone in model.skeleton.bones])
     has_balls = np.flatnonzero(np.isfinite(model.visible_radii_m).all(axis=(1, 2)))
     balls = three_balls(has_balls, lengths, model.visible_radii_m[has_balls], model.stations[has_balls])
@@ -288,6 +295,8 @@ def body_of(text: str, path: str = "of a checkpoint") -> BodyShape:
 
 def _shape(table: dict[str, Any]) -> BodyShape:
     rows = table["bones"]
+    if len(rows) > MOST_BONES or len(table.get("metaballs", [])) > MOST_BALLS:
+        raise ValueError(f"more than {MOST_BONES} bones or {MOST_BALLS} metaballs")
     bones = tuple(
         Bone(
             name=str(t["name"]),

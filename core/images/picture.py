@@ -7,9 +7,10 @@ import numpy as np
 
 from ..foundation import bounded
 from ..foundation.errors import InputError
-from .headers import claimed_size, has_several_images
+from .headers import claimed_size, has_several_images, memory_bytes
 
 MAX_PIXELS = 36_000_000  # of 8K video
+MOST_BYTES, BYTES_PER_BYTE = 400_000_000, 100  # of memory for an image, and for each byte of a larger file
 MAX_SIDE_PX = 8191  # OpenCV looks up four times as many
 OPEN_EXR = b"\x76\x2f\x31\x01"
 OTHER_SIZE = "{path} has {w}×{h} pixels, but its camera has {size[0]}×{size[1]}; use the footage as it was calibrated."
@@ -31,13 +32,17 @@ def decoded(path: Path, size_px: tuple[int, int] | None = None) -> np.ndarray:
 
     Raises:
         InputError: the file is missing, is not an image, has several, is too large (MAX_PIXELS, MAX_SIDE_PX), has another size (width,
-            height) than `size_px`, or an unsupported type of pixels.
+            height) than `size_px`, an unsupported type of pixels, or unpacks to far more than its own size.
     """
     content = _content(path)
     claimed = claimed_size(content)
     refuse_size(claimed, path)
     if claimed is not None and size_px is not None and claimed != size_px:
         raise InputError(OTHER_SIZE.format(path=path, w=claimed[0], h=claimed[1], size=size_px))
+    if claimed is not None and (memory := memory_bytes(content, claimed)) > max(MOST_BYTES, BYTES_PER_BYTE * len(content)):
+        raise InputError(
+            f"{path} would unpack to {memory / 1e9:.1f} GB, more than {BYTES_PER_BYTE} times its size; save it with 8 bits per channel."
+        )
     if has_several_images(content):
         raise InputError(f"{path} has several images, of which only one would be measured; write each of them to a file of its own.")
     try:
@@ -85,7 +90,7 @@ def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
     if image.ndim == 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY) if image.shape[2] >= 3 else image[:, :, 0]
     if image.dtype == np.uint16:
-        return (image / np.float32((white or WHITES[-1]) / 255)).astype(np.float32)
+        return (image / np.float32((white or WHITES[-1]) / 255)).astype(np.float32, copy=False)
     if image.dtype.kind == "f":
         return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
     return image.astype(np.float32)

@@ -3,6 +3,7 @@
 Files are read on demand, so a long sequence needs no more memory than a short one.
 """
 
+import os
 import re
 import shlex
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..foundation import bounded
 from ..foundation.errors import InputError
 from .packets import Packets
 from .picture import OTHER_SIZE, WHITES, colour, decoded, grey, refuse_open_exr, refuse_size
+from .sample_tables import claimed_samples
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
@@ -32,6 +34,7 @@ SIGNATURES = (
     b"P6",
 )
 MOVIE_SIGNATURES = (b"RIFF", b"\x1a\x45\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"\x47")  # AVI, Matroska, MPEG: program, video, transport
+GIF = b"GIF8"  # begins like a transport stream
 MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # one of them begins an MP4 or QuickTime file
 MARKED = (
     "{path} is marked as interlaced, and such movies cannot be decoded here; take the mark away, which keeps its fields as they are: "
@@ -43,6 +46,7 @@ CUT = (
     "The header of {path} has {count} images, but more follow, as after a recording that did not end properly; "
     "write it anew: ffmpeg -i {name} -c copy new.mkv"
 )
+TOO_MANY = "{path} is not a movie that can be decoded ({reason}); write it anew: ffmpeg -i {name} -c copy new.mkv"
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
 
 
@@ -105,8 +109,7 @@ class ImageFiles:
         """The grey value of white: cameras of 10 or 12 bits often write files of 16 bits."""
         if self._top is None:
             samples = sorted({0, len(self._paths) // 2, len(self._paths) - 1})
-            first = decoded(self._paths[0], self._size_px)
-            if first.dtype != np.uint16:
+            if decoded(self._paths[0], self._size_px).dtype != np.uint16:
                 self._top = 0.0
             else:
                 brightest = max(int(decoded(self._paths[i], self._size_px).max()) for i in samples)
@@ -324,8 +327,24 @@ def _check_movie(path: Path) -> None:
         raise InputError(f"The movie {path} is of an unsupported kind ({', '.join(MOVIE_ENDINGS)}); convert it to H.264 in .mp4.")
     bounded.check_name(path)
     first = _first_bytes(path, "movie")
-    if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES):
+    if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES) or first.startswith(GIF):
         raise InputError(NO_MOVIE.format(path=path))
+    if first[4:8] in MOVIE_BOXES:
+        _check_samples(path)
+
+
+def _check_samples(path: Path) -> None:
+    """FFmpeg makes an entry for every sample that a table claims, and each has a byte at least."""
+    try:
+        with bounded.opened(path, bounded.MOVIE_BYTES) as file:
+            size = os.fstat(file.fileno()).st_size
+            count = claimed_samples(file, size)
+            if count > size:
+                raise ValueError(f"its tables claim {count} images or sounds, more than its {size} bytes can be")
+    except OSError as error:
+        raise InputError(f"Cannot read the movie {path}: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise InputError(TOO_MANY.format(path=path, reason=error, name=shlex.quote(path.name))) from error
 
 
 def _first_bytes(path: Path, what: str) -> bytes:

@@ -1,5 +1,5 @@
-"""What an ONNX file says about its input, and whether it names other files, read from its protocol buffer; OpenCV does not tell it, and
-reads weights from any file of the system that a network names.
+"""What an ONNX file says about its input, how many nodes it has, and whether it names other files, read from its protocol buffer; OpenCV
+does not tell it, and reads weights from any file of the system that a network names.
 
 Only a few fields are looked at (onnx.proto3): those of INSIDE, and of an input the dimensions. A field that may be there once, such as
 ModelProto.graph, may be there in several parts, which readers put together.
@@ -12,14 +12,17 @@ from ..foundation import bounded
 from ..foundation.errors import InputError
 
 ONNX_BYTES = 1 << 30
+MOST_NODES = 10_000  # ten times as many as pose networks have; OpenCV needs 20 µs for one, with every image
+MOST_MESSAGES = 100_000  # nodes, their attributes, tensors, and inputs
 GRAPH, INITIALIZER, INPUT = 7, 5, 11  # fields of ModelProto and GraphProto
 NAME, TYPE = 1, 2  # of ValueInfoProto
 TENSOR_NAME, EXTERNAL_DATA, DATA_LOCATION = 8, 13, 14  # of TensorProto
-INSIDE = {  # the messages in which there may be tensors, by their fields
+INSIDE: dict[str, dict[int, str]] = {  # the messages in which there may be tensors, by their fields
     "model": {GRAPH: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute"},
-    "graph": {1: "node", INITIALIZER: "tensor", 15: "sparse"},
+    "graph": {1: "node", INITIALIZER: "tensor", INPUT: "input", 15: "sparse"},
+    "input": {},
     "node": {5: "attribute"},
     "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
@@ -47,15 +50,17 @@ def input_shape(data: bytes, path: Path) -> tuple[int, ...]:
     """The sizes of the only input of a network, 0 where it leaves them open. `path` is named in messages.
 
     Raises:
-        InputError: the data are no ONNX file, have several inputs, or name other files.
+        InputError: the data are no ONNX file, have several inputs or too many nodes, or name other files.
     """
     try:
-        shapes = _input_shapes(memoryview(data))
-        external = _names_files(memoryview(data))
+        external, nodes = _inside(memoryview(data))
+        shapes = _input_shapes(memoryview(data)) if nodes <= MOST_NODES else []
     except ValueError as error:
         raise InputError(f"{path} is no ONNX file, or it is damaged: {error}.") from error
     if external:
         raise InputError(f"{path} has its weights in other files; save the network as one file, without external data.")
+    if nodes > MOST_NODES:
+        raise InputError(f"{path} is a network of more than {MOST_NODES} nodes; use a smaller one.")
     if len(shapes) != 1:
         raise InputError(f"{path} is a network with {len(shapes)} inputs; give one that takes an image, such as RTMPose's.")
     return shapes[0]
@@ -78,18 +83,26 @@ def _input_shapes(data: memoryview) -> list[tuple[int, ...]]:
     return [shape for name, shape in inputs.items() if name not in stored]
 
 
-def _names_files(model: memoryview) -> bool:
-    """Whether any tensor of a network is in another file."""
-    waiting = [("model", model)]
-    while waiting:
+def _inside(model: memoryview) -> tuple[bool, int]:
+    """Whether any tensor of a network is in another file, and how many nodes there are, those in other nodes included; more than MOST_NODES
+    are not counted.
+
+    Raises:
+        ValueError: it is damaged, or has more than MOST_MESSAGES parts.
+    """
+    waiting, external, nodes, messages = [("model", model)], False, 0, 0
+    while waiting and nodes <= MOST_NODES:
         kind, message = waiting.pop()
+        nodes += kind == "node"
         for number, value in _fields(message):
             if kind == "tensor":
-                if number in (EXTERNAL_DATA, DATA_LOCATION) and value:
-                    return True
+                external |= number in (EXTERNAL_DATA, DATA_LOCATION) and bool(value)
             elif isinstance(value, memoryview) and (inner := INSIDE[kind].get(number)):
                 waiting.append((inner, value))
-    return False
+                messages += 1
+                if messages > MOST_MESSAGES:
+                    raise ValueError(f"it has more than {MOST_MESSAGES} nodes, tensors and inputs")
+    return external, nodes
 
 
 def _named_shape(info: memoryview) -> tuple[bytes, tuple[int, ...]]:
@@ -115,17 +128,17 @@ def _fields(data: memoryview) -> Iterator[Field]:
     """The fields of a message: their numbers, and their numbers or bytes."""
     at = 0
     while at < len(data):
-        key, at = _varint(data, at)
+        key, at = (data[at], at + 1) if data[at] < 128 else _varint(data, at)
         kind = key & 7
         if not 0 < key >> 3 <= LARGEST_FIELD:
             raise ValueError("a field has no number")
         if kind == VARINT:
-            value, at = _varint(data, at)
+            value, at = (data[at], at + 1) if at < len(data) and data[at] < 128 else _varint(data, at)
             yield key >> 3, value
             continue
         size = {BIT64: 8, BIT32: 4}.get(kind, -1)
         if kind == BYTES:
-            size, at = _varint(data, at)
+            size, at = (data[at], at + 1) if at < len(data) and data[at] < 128 else _varint(data, at)
         if size < 0 or at + size > len(data):
             raise ValueError("a field goes beyond its end")
         yield key >> 3, data[at : at + size]

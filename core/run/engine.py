@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -60,8 +61,8 @@ def dask_client(engine: Engine) -> Iterator[Any]:
             # Else Dask writes to files of fixed names in the folder of all users' temporary files, where others may have put links.
             private = running.enter_context(TemporaryDirectory(prefix="tricap-dask-", ignore_cleanup_errors=True))
             running.enter_context(dask.config.set({**settings, "temporary-directory": private}))
-            cluster = running.enter_context(
-                LocalCluster(
+            with _not_interrupted():
+                cluster = LocalCluster(
                     n_workers=engine.workers,
                     threads_per_worker=1,
                     processes=True,
@@ -73,13 +74,26 @@ def dask_client(engine: Engine) -> Iterator[Any]:
                     local_directory=private,
                     env=thread_limits(engine.workers, os.cpu_count() or 1),
                 )
-            )
+            running.enter_context(cluster)
             client = running.enter_context(Client(cluster))
         except (OSError, RuntimeError) as error:
             raise InputError(
                 f"The worker processes cannot be started ({error}); raise the system's limits of files and processes, or use --workers 1."
             ) from error
         yield client
+
+
+@contextmanager
+def _not_interrupted() -> Iterator[None]:
+    """Threads and processes that begin here do not get the Ctrl-C of a terminal: the workers would say so, each with a traceback."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def thread_limits(workers: int, cores: int) -> dict[str, str]:

@@ -47,6 +47,7 @@ def test_things_of_the_user_stay_and_hold_on_to_the_new_body(blender: ModuleType
     body, scene = built(blender, out), blender.context.scene
     sword, lamp, copy = (blender.data.objects.new(name, None) for name in ("Sword", "Lamp", "Copy"))
     copy = body.copy()
+    body.scale = (1.5, 1.5, 1.5)
     part = body.users_collection[0]
     for thing in (sword, lamp, copy):
         part.objects.link(thing)  # as Blender does with what is added while this collection is active
@@ -70,6 +71,7 @@ def test_things_of_the_user_stay_and_hold_on_to_the_new_body(blender: ModuleType
     assert {"Sword", "Lamp", "Shield", "Body", copy.name} <= names and "Hero" not in names and not [n for n in names if "earlier" in n]
     assert {"Sword", "Lamp", "Shield"} <= {o.name for o in scene.objects}
     assert sword.parent == follow.target == driver.variables[0].targets[0].id == body
+    assert body.scale.x == pytest.approx(1.5) and copy.scale.x == pytest.approx(1.0)
     assert "Props" in scene.collection.children and [c.name for c in blender.data.collections].count("Tricap") == 1
 
 

@@ -187,6 +187,24 @@ def test_two_keys_in_a_million_frames_are_refused(empty: ModuleType) -> None:
         action_frames(moving)
 
 
+def test_two_keys_of_many_curves_are_two_keys(empty: ModuleType) -> None:
+    """A glTF file of 20 kB with two keys of 150 bones took minutes and gigabytes."""
+    from tricap.addon.retarget.playing import exported_frames
+    from tricap.addon.retarget.read import action_frames
+    from tricap.core.foundation.errors import InputError
+
+    moving = build_armature(squat(person(), frames=3), "Hero")
+    curves = moving.animation_data.action.layers[0].strips[0].channelbags[0].fcurves
+    for curve in curves:
+        curve.keyframe_points[-1].co[0] = 20_100
+    assert sum(len(curve.keyframe_points) for curve in curves) > 210
+    with pytest.raises(InputError, match="reaches from frame .* to 20100, with values for 3 alone"):
+        action_frames(moving)
+    empty.context.scene.frame_start, empty.context.scene.frame_end = 0, 20_100
+    with pytest.raises(InputError, match="The scene plays from frame 0 to 20100, with values for 3 alone"):
+        exported_frames(empty.context.scene)
+
+
 def test_a_map_of_a_stranger_is_data_alone(small_run: SmallRun, tmp_path: Path, ran: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "map.json").write_text(json.dumps({"name": f"__import__('os').mkdir({str(ran)!r})", "bones": {"hips": "__class__"}}))
     write_bvh(tmp_path / "rig.bvh", squat(person(), frames=2))

@@ -8,6 +8,7 @@ specification", Blender developers' blog (2013); from version 7500 on, with word
 
 import struct
 import zlib
+from collections import Counter
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,6 +22,8 @@ ARRAYS = {"b": 1, "c": 1, "i": 4, "l": 8, "f": 4, "d": 8}  # bytes of an element
 TEXTS = "RS"
 DEEPEST = 64  # records in each other
 MOST_OBJECTS = 5_000  # models, meshes, materials, …: whatever becomes a thing of Blender's
+MOST_OF_A_KIND = 1_000  # other than models; beyond, Blender searches for a free name for seconds
+MODEL = "Model"
 MANY = ("AnimationCurve", "AnimationCurveNode", "Deformer", "NodeAttribute")  # are parts of others
 MOST_PATHS, STEPS = 1_000_000, 4  # along so many connections
 LAYER = "AnimationLayer"
@@ -61,6 +64,7 @@ class _Walk:
         self._file, self._path = file, path
         self._size = path.stat().st_size
         self._unpacked = self._objects = 0
+        self._kinds = Counter[str]()
         self.joined: list[tuple[int, int]] = []  # the objects that are connected, by their numbers: child and parent
         self.layers: set[int] = set()  # the numbers of the animation's layers
         self.pictures: set[str] = set()  # the names of their files
@@ -83,9 +87,8 @@ class _Walk:
         name = self._file.read(length).decode("latin-1")
         if depth > DEEPEST or end > room_to or values > end - self._file.tell():
             raise ValueError("a record that does not fit into the file")
-        self._objects += parent == "Objects" and name not in MANY
-        if self._objects > MOST_OBJECTS:
-            raise InputError(f"{self._path} has more than {MOST_OBJECTS} objects; export the rig alone.")
+        if parent == "Objects" and name not in MANY:
+            self._count(name)
         named = (parent, name) in PICTURES
         numbers = [found for _ in range(values) if (found := self._value(end, named)) is not None]
         if parent == "Connections" and len(numbers) > 1:
@@ -97,6 +100,14 @@ class _Walk:
         if self._file.tell() != end:
             raise ValueError("a record that does not end where it claims to")
         return True
+
+    def _count(self, kind: str) -> None:
+        self._objects += 1
+        self._kinds[kind] += kind != MODEL
+        if self._objects > MOST_OBJECTS:
+            raise InputError(f"{self._path} has more than {MOST_OBJECTS} objects; export the rig alone.")
+        if self._kinds[kind] > MOST_OF_A_KIND:
+            raise InputError(f"{self._path} has more than {MOST_OF_A_KIND} objects of the kind “{kind[:40]}”; export the rig alone.")
 
     def _value(self, end: int, named: bool) -> int | None:
         """Pass a value; returns it if it is a number of an object. `named`: texts are names of pictures."""

@@ -1,13 +1,15 @@
 """body.toml and model files: round trips, and what they refuse."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tricap.core.body.model_file import model_files, model_names, read_model
-from tricap.core.body.shape import FingerBend, default_shape, read_body, write_body
+from tricap.core.body.shape import MOST_BALLS, MOST_BONES, FingerBend, default_shape, read_body, write_body
 from tricap.core.foundation.errors import InputError
 
 
@@ -76,6 +78,29 @@ def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match="run the fit again"):
         read_body(path)
+
+
+@pytest.mark.parametrize(("entry", "most"), [("[[bones]]", MOST_BONES), ("[[metaballs]]", MOST_BALLS)])
+def test_a_body_of_thousands_of_bones_or_metaballs_is_refused(entry: str, most: int, tmp_path: Path) -> None:
+    """Blender would be given each of them: 6000 metaballs took 13 s and a gigabyte."""
+    path = tmp_path / "body.toml"
+    write_body(path, default_shape(read_model("arm.R")))
+    first, *others = path.read_text().split(f"{entry}\n")
+    last, end = others[-1].split("\n\n", 1)
+    more = [re.sub('name = ".*"', f'name = "copy {i}"', last, count=1) for i in range(most - len(others))]
+    path.write_text(f"{entry}\n".join([first, *others[:-1], last + "\n\n", *(f"{one}\n\n" for one in more)]) + end)
+    if entry == "[[metaballs]]":
+        assert len(read_body(path).metaballs.weight) == most
+    path.write_text(path.read_text().replace(f"{entry}\n", f"{entry}\n{last}\n\n{entry}\n", 1))
+    with pytest.raises(InputError, match="more than 500 bones or 2000 metaballs"):
+        read_body(path)
+
+
+def test_a_model_of_thousands_of_bones_is_refused() -> None:
+    model = read_model("arm.R")
+    bones = (model.skeleton.bones[0],) * (MOST_BONES + 1)
+    with pytest.raises(InputError, match="“arm.R” has 501 bones, more than 500; use another"):
+        default_shape(SimpleNamespace(name=model.name, skeleton=SimpleNamespace(bones=bones)))  # type: ignore[arg-type]
 
 
 def test_a_metaball_of_no_bone_is_named(tmp_path: Path) -> None:

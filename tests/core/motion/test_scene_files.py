@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tricap.core.foundation.errors import InputError
+from tricap.core.motion.formats import gltf
 from tricap.core.motion.formats.fbx import MOST_OBJECTS, check_fbx
 from tricap.core.motion.formats.gltf import MOST_BONES, MOST_NODES, check_gltf
 
@@ -36,6 +37,8 @@ def test_a_sound_fbx_file_is_let_through(tmp_path: Path, version: int) -> None:
         ([geometry(zeros(12_000_000, claimed=3))], "an array whose length is not as it claims"),
         ([geometry(zeros(3, claimed=4_000_000_000))], "would unpack to more than 32.0 GB"),
         ([model(i) for i in range(MOST_OBJECTS + 1)], "more than 5000 objects; export the rig alone"),
+        ([record(b"Material", [number(i)]) for i in range(1001)], "more than 1000 objects of the kind “Material”; export the rig alone"),
+        ([record(b"Geometry", [number(i)]) for i in range(1001)], "more than 1000 objects of the kind “Geometry”"),
         ([model(1), record(b"Model", [b"?"])], "a value of an unknown kind"),
         ([record(b"Model", [b"S" + struct.pack("<I", 2**32 - 1)])], "a value that does not fit"),
     ],
@@ -99,6 +102,85 @@ FLOATS = {"componentType": 5126, "type": "VEC3"}
 REUSED = [{"primitives": [{"attributes": {"POSITION": 0}}] * 4000}]
 GPU = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}}
 MESHOPT = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 36, "byteStride": 12, "count": 10**8}}
+
+
+TRIANGLE: dict[str, Any] = {"attributes": {"POSITION": 0}}
+EACH_MATERIAL = [{"primitives": [{**TRIANGLE, "material": i // 2}]} for i in range(2 * gltf.MOST_MATERIALS + 2)]
+COLOURED = [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 0}, "material": i}, {**TRIANGLE, "material": i}]} for i in range(501)]
+VARIANTS = {"KHR_materials_variants": {"mappings": [{"material": i, "variants": [0] * 9} for i in range(100)]}}
+WIDE = {"attributes": {"POSITION": 0} | {f"TEXCOORD_{i}": 0 for i in range(8)} | {f"_{i}": 0 for i in range(100)}}
+SHAPED: dict[str, Any] = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 0}] * 20}
+LARGE: dict[str, Any] = {"attributes": {"POSITION": 1}}
+TWO_SIZES = [{**FLOATS, "count": 3}, {**FLOATS, "count": 300_000}]
+
+
+def skinned(count: int, joints: int, **more: Any) -> dict[str, Any]:
+    """A mesh in nodes with skins of their own, as it is made for each."""
+    nodes = [{"mesh": 0, "skin": i} for i in range(count)]
+    return {"nodes": nodes, "skins": [{"joints": [0] * joints}] * count, **more}
+
+
+WORK: dict[str, tuple[dict[str, Any], str]] = {
+    "scenes": ({"scenes": [{"nodes": [0]}] * (gltf.MOST_SCENES + 1)}, "101 scenes, more than 100; export the rig alone"),
+    "a scene's nodes": ({"scenes": [{"nodes": [0] * (gltf.MOST_LISTED + 1)}]}, "100001 nodes in its scenes, more"),
+    "nodes in scenes": (
+        {
+            "scenes": [{"nodes": [0]}] * 51,
+            "nodes": [{"children": [i + 1]} for i in range(190)] + [{"children": [*range(191, 2000)]}, *[{}] * 1809],
+        },
+        "102000 nodes in its scenes",
+    ),
+    "materials": (
+        {"meshes": [{"primitives": [part for mesh in EACH_MATERIAL for part in mesh["primitives"]][::2]}]},
+        "1001 materials, more",
+    ),
+    "materials with colours": ({"meshes": COLOURED}, "1002 materials, more"),
+    "primitives": ({"meshes": [{"primitives": [TRIANGLE] * (gltf.MOST_PRIMITIVES + 1)}]}, "1001 primitives in its meshes, more"),
+    "meshes": ({"meshes": [{"primitives": []}] * (gltf.MOST_PRIMITIVES + 1)}, "1001 primitives in its meshes"),
+    "a mesh with every skin": (skinned(1001, 1), "1001 primitives in its meshes"),
+    "shapes with every weight": ({"meshes": [{"primitives": [SHAPED]}], "nodes": [{"mesh": 0}] * 1001}, "1001 primitives in its meshes"),
+    "variants": ({"meshes": [{"primitives": [{**TRIANGLE, "extensions": VARIANTS}]}]}, "1001 primitives in its meshes"),
+    "joined": (
+        {"meshes": [{"primitives": [TRIANGLE] * 900}], "accessors": [{**FLOATS, "count": 3000}]},
+        "7290000000 numbers to be copied while its meshes are joined, more than 2000000000",
+    ),
+    "numbers with every skin": (skinned(12, 1, accessors=[{**FLOATS, "count": 300_000}]), "asks for 10800000 numbers"),
+    "attributes for all": ({"meshes": [{"primitives": [WIDE, LARGE]}], "accessors": TWO_SIZES}, "asks for 98100981 numbers"),
+    "shapes for all": ({"meshes": [{"primitives": [SHAPED, LARGE]}], "accessors": TWO_SIZES}, "asks for 18900189 numbers"),
+    "joints": (skinned(1, 3, skins=[{"joints": [0] * 3000}] * 17), "54000 joints in its skins"),
+    "joints in meshes": (skinned(30, 1000), "60000 joints in its skins and the meshes with them"),
+    "images": ({"images": [{"bufferView": 0}] * (gltf.MOST_IMAGES + 1)}, "201 images, more than 200"),
+    "channels": (
+        {"animations": [{"channels": [{"sampler": 0}] * (gltf.MOST_CHANNELS // 2 + 1), "samplers": [{"input": 0, "output": 0}]}] * 2},
+        "3002 channels in its animations, more than 3000",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WORK)
+def test_a_gltf_file_that_makes_blender_work_for_minutes(tmp_path: Path, case: str) -> None:
+    parts, said = WORK[case]
+    path = write_gltf(tmp_path / "a.glb", **parts)
+    assert path.stat().st_size < 1_000_000
+    before, began = memory_mb()[1], time.process_time()
+    with pytest.raises(InputError, match=said):
+        check_gltf(path)
+    assert time.process_time() - began < 1.0 and memory_mb()[1] - before < 100
+
+
+def test_a_rich_character_is_let_through(tmp_path: Path) -> None:
+    """A hundred meshes of three primitives on a skeleton of 300 bones, with colours, shapes and twenty animations."""
+    count, bones = 100, 300
+    parts = [{"attributes": {"POSITION": 0, "COLOR_0": 0}, "material": i, "targets": [{"POSITION": 0}] * 50} for i in range(3)]
+    nodes = [{"children": list(range(1, bones))}, *[{}] * (bones - 1), *[{"mesh": i, "skin": 0} for i in range(count)]]
+    channels = [{"sampler": 0, "target": {"node": i, "path": "rotation"}} for i in range(bones)]
+    path = write_gltf(
+        tmp_path / "a.gltf", nodes=nodes, skins=[{"joints": list(range(bones))}], materials=[{}] * 3,
+        scenes=[{"nodes": [0, *range(bones, bones + count)]}] * 10,
+        meshes=[{"primitives": parts}, *[{"primitives": [TRIANGLE] * 3}] * (count - 1)],
+        animations=[{"channels": channels, "samplers": [{"input": 0, "output": 0}]}] * 10,
+    )  # fmt: skip
+    check_gltf(path)
 
 
 @pytest.mark.parametrize("ending", [".glb", ".gltf"])

@@ -1,14 +1,16 @@
 """Pose networks of the user's own: every layout sees dots that were drawn; what is no such network is refused with the reason."""
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
+from tricap.core.networks.onnx_file import input_shape
 from tricap.core.networks.pose_network import PoseNetwork
 
-from ...pose_graphs import SEEN, constant_maps, drawn, external_graph, pose_graph, tiny_graph
+from ...pose_graphs import SEEN, constant_maps, costly_graph, drawn, external_graph, pose_graph, tiny_graph
 
 PICTURE, BOX = (520, 400), (196.0, 80.0, 326.0, 298.0)
 
@@ -78,6 +80,7 @@ REFUSED = {
     "weights in any file": (lambda whole: external_graph("/etc/passwd"), "has its weights in other files"),
     "weights in a file, in a second part": (lambda whole: external_graph("w.bin", parts=2), "has its weights in other files"),
     "weights in a file, in a branch": (lambda whole: external_graph("w.bin", branch=True), "has its weights in other files"),
+    "more nodes than any network": (lambda whole: costly_graph(1, 10_000), "a network of more than 10000 nodes; use a smaller one"),
     "field 0": (lambda whole: whole + b"\x00\x00", "a field has no number"),
     "unknown operation": (lambda whole: whole.replace(b"Relu", b"Rolu"), "OpenCV cannot read the network"),
 }
@@ -89,6 +92,20 @@ def test_what_is_no_pose_network_is_refused(tmp_path: Path, case: str) -> None:
     with pytest.raises(InputError) as error:
         opened(tmp_path, made(pose_graph("heat maps", 17, (64, 64))))
     assert said in str(error.value) and "pose.onnx" in str(error.value)
+
+
+@pytest.mark.parametrize("part", [b"\x0a\0", b"\x2a\0", b"\x5a\0", b"\x7a\0", b"\x08\1"])
+def test_a_megabyte_of_empty_parts_is_read_in_a_moment(tmp_path: Path, part: bytes) -> None:
+    """Nodes, tensors, inputs, sparse tensors and what is unknown, of two bytes each."""
+    data = b"\x3a\xa0\xe8\x3b" + 490_000 * part
+    began = time.process_time()
+    with pytest.raises(InputError, match="it has more than 100000 nodes, tensors and inputs|a network with 0 inputs"):
+        input_shape(data, tmp_path / "pose.onnx")
+    assert time.process_time() - began < 1.5
+
+
+def test_a_large_network_may_have_thousands_of_nodes(tmp_path: Path) -> None:
+    assert input_shape(costly_graph(1, 9_000), tmp_path / "pose.onnx") == (1, 3, 64, 48)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
