@@ -3,7 +3,6 @@
 Motion is read by playing the scene once, with constraints, drivers and layers; everything else is done on arrays.
 """
 
-import hashlib
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeVar, cast
@@ -20,7 +19,7 @@ from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
 from ...core.motion.retarget.transfer import standing_turn
 from ..scene import layers, stored
-from ..scene.action_curves import curves_of
+from ..scene.action_curves import curves_of, keys_digest
 from ..scene.armature import ROLES_KEY
 
 A = TypeVar("A")
@@ -314,13 +313,3 @@ def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action 
 def _has_residual(action: bpy.types.Action) -> bool:
     residual = stored.table(action, RESIDUAL_KEY)
     return all(isinstance(residual.get(name), str) for name in ("motion", "keys"))
-
-
-def keys_digest(action: bpy.types.Action) -> str:
-    """A digest of the frames and values of all keys of an action."""
-    total = hashlib.sha256()
-    for curve in sorted(curves_of(action), key=lambda curve: (curve.data_path, curve.array_index)):
-        keys = np.empty(2 * len(curve.keyframe_points), dtype=np.float32)
-        curve.keyframe_points.foreach_get("co", keys)
-        total.update(f"{curve.data_path} {curve.array_index}".encode() + keys.tobytes())
-    return total.hexdigest()

@@ -12,8 +12,8 @@ from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import needed_keys
 from ..editing.curves import replace_keys
 from ..scene.action import key
-from ..scene.action_curves import curves_of
-from .read import RESIDUAL_KEY, keys_digest, scale_of, world_matrix
+from ..scene.action_curves import curves_of, keys_digest
+from .read import RESIDUAL_KEY, scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
 REST = {

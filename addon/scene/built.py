@@ -1,23 +1,21 @@
 """Marks by which a later build tells its own things from the user's: objects by their names, actions by their keys."""
 
-import hashlib
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import bpy
-import numpy as np
 
 from . import stored
-from .action_curves import curves_of
+from .action_curves import curves_of, keys_digest
 
-NAME_KEY = "tricap_built"  # custom property of objects and collections of a build: the name that they got; copies have another one
-CURVES_KEY = "tricap_built_curves"  # custom property of its actions: a digest of their curves
+NAME_KEY = "tricap_built"  # custom property of a build's collection and its objects: the name that they got; copies have another one
+CURVES_KEY = "tricap_built_curves"  # custom property of its actions: a digest of their keys
 
 
 def mark(collection: bpy.types.Collection) -> None:
     """Mark a build's collection and all that is in it."""
-    for thing in (collection, *collection.children_recursive, *collection.all_objects):
+    for thing in (collection, *collection.all_objects):
         mark_name(thing)
     mark_actions(action for thing in collection.all_objects for action in actions_of(thing))
 
@@ -27,15 +25,14 @@ def mark_name(thing: bpy.types.Object | bpy.types.Collection) -> None:
     thing[NAME_KEY] = thing.name
 
 
-def is_own(thing: bpy.types.Object | bpy.types.Collection) -> bool:
+def is_own(thing: bpy.types.Object) -> bool:
     """Whether Tricap made it, under this name or another; a copy of what Tricap made is the user's."""
     name = stored.text(thing, NAME_KEY)
     if not name or name == thing.name:
         return bool(name)
-    kind = bpy.data.objects if isinstance(thing, bpy.types.Object) else bpy.data.collections
-    marked = [other for other in kind if stored.text(other, NAME_KEY) == name]
-    copies = re.compile(re.escape(name) + r"\.\d+")
-    return name not in [other.name for other in marked] and [other for other in marked if not copies.fullmatch(other.name)] == [thing]
+    others = [other for other in bpy.data.objects if stored.text(other, NAME_KEY) == name]
+    renamed = [other for other in others if not re.fullmatch(re.escape(name) + r"\.\d+", other.name)]
+    return renamed == [thing]  # the first one would be among them, if it still had its name
 
 
 def actions_of(thing: bpy.types.Object) -> set[bpy.types.Action]:
@@ -49,12 +46,13 @@ def actions_of(thing: bpy.types.Object) -> set[bpy.types.Action]:
 def mark_actions(actions: Iterable[bpy.types.Action]) -> None:
     """Mark the curves of actions as Tricap made them."""
     for action in actions:
-        action[CURVES_KEY] = _digest(action)
+        action[CURVES_KEY] = keys_digest(action)
 
 
 def is_edited(action: bpy.types.Action) -> bool:
     """Whether an action has curves that Tricap did not make, or not so."""
-    return bool(curves_of(action)) and stored.text(action, CURVES_KEY) != _digest(action)
+    curves = curves_of(action)
+    return bool(curves) and (any(c.modifiers for c in curves) or stored.text(action, CURVES_KEY) != keys_digest(action))
 
 
 @contextmanager
@@ -63,12 +61,3 @@ def no_edit(actions: Iterable[bpy.types.Action]) -> Iterator[None]:
     unedited = [action for action in actions if not is_edited(action)]
     yield
     mark_actions(unedited)
-
-
-def _digest(action: bpy.types.Action) -> str:
-    digest = hashlib.sha256()
-    for curve in sorted(curves_of(action), key=lambda curve: (curve.data_path, curve.array_index)):
-        keys = np.empty(2 * len(curve.keyframe_points), dtype=np.float32)
-        curve.keyframe_points.foreach_get("co", keys)
-        digest.update(f"{curve.data_path} {curve.array_index} {len(keys)} {len(curve.modifiers)} ".encode() + keys.tobytes())
-    return digest.hexdigest()[:16]

@@ -49,10 +49,9 @@ class Earlier:
             name = stored.text(thing, built.NAME_KEY) or self.names.get(thing, thing.name)
             if (other := new.get(name)) is not None and other.type == thing.type:
                 thing.user_remap(other)
-        collections = [*self.collections]
-        self.names = {thing: name for thing, name in self.names.items() if thing not in {*self.objects, *collections}}
+        self.names = {thing: name for thing, name in self.names.items() if thing in self.used}
         bpy.data.batch_remove(self.objects)
-        bpy.data.batch_remove(collections)
+        bpy.data.batch_remove(self.collections)
         shown = {clips.clip_behind(camera) for camera in bpy.data.cameras}
         if scene.active_clip in self.used - shown:
             scene.active_clip = None
@@ -85,7 +84,8 @@ class Earlier:
         actions = {action for o in objects for action in built.actions_of(o)}
         for action in sorted(actions, key=lambda action: action.name):
             if built.is_edited(action):
-                action.use_fake_user = True
+                if action.library is None:
+                    action.use_fake_user = True
                 self.edited.append(action)
         used |= actions - {*self.edited}
         used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}

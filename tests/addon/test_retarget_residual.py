@@ -12,6 +12,7 @@ from tricap.addon.retarget import read
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.read import action_frames, read_motion, read_rig
 from tricap.addon.retarget.write import push_to_strip
+from tricap.addon.scene.action_curves import keys_digest
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rotation import angle_of, transposed
 from tricap.core.motion.retarget.rig import Motion
@@ -50,7 +51,7 @@ def test_the_operators_bring_all_bones_back(blender: ModuleType) -> None:
     point.co[1] += 0.01
     assert bpy.ops.tricap.retarget(source="Few", target="Full") == {"FINISHED"}
     assert off_deg(wanted, played(full)) > 5.0 and "was edited" in bpy.context.scene.tricap_retarget.last
-    few.animation_data.action[read.RESIDUAL_KEY] = {"motion": "{", "keys": read.keys_digest(few.animation_data.action)}
+    few.animation_data.action[read.RESIDUAL_KEY] = {"motion": "{", "keys": keys_digest(few.animation_data.action)}
     with pytest.raises(RuntimeError, match="damaged"):
         bpy.ops.tricap.retarget(source="Few", target="Full")
 

@@ -42,7 +42,6 @@ class _Foot:
     normals: np.ndarray  # (N, 3)
     flip: np.ndarray  # (3,)
     R: np.ndarray  # (3, 3) axes of its bone in the rest pose
-    ankle_m: np.ndarray  # (3,)
 
 
 def with_feet_in_place(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints]) -> OneSkin:
@@ -87,7 +86,7 @@ def _foot(skin: OneSkin, shape: BodyShape, b: int, frames: Sequence[SurfacePoint
     across = vertex_normals(skin.vertices_m, skin.faces) @ R
     compared = (own > OWN) & (np.linalg.norm(local, axis=1) > HEM * shape.lengths_m[b])
     movable = Movable(x=local * flip, across=across * flip, share=share, own=compared, middle=np.zeros(3))
-    return _Foot(movable=movable, points=points * flip, normals=normals * flip, flip=flip, R=R, ankle_m=ankle)
+    return _Foot(movable=movable, points=points * flip, normals=normals * flip, flip=flip, R=R)
 
 
 def _near(foot: _Foot) -> Movable:
