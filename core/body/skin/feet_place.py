@@ -15,7 +15,7 @@ from ..shape import BodyShape
 from ..skeleton import bone_frames
 from .closed_skin import OneSkin
 from .extremities import has_end
-from .fingers import FINGER_BONE
+from .foot_template import TOE
 from .relief import Nearby, SurfacePoints
 from .similarity import Movable, Prior, points_about, registered
 from .surface_operators import vertex_normals
@@ -78,8 +78,7 @@ def _foot(skin: OneSkin, shape: BodyShape, b: int, frames: Sequence[SurfacePoint
     names, R, ankle = [bone.name for bone in shape.skeleton.bones], axes[b], heads[b]
     side = names[b][-2:]
     flip = MIRRORED if side == ".L" else np.ones(3)
-    toes = [name.endswith(side) and name.startswith("toe") and FINGER_BONE.fullmatch(name) is not None for name in names]
-    own = skin.weights[:, b] + skin.weights[:, toes].sum(axis=1)
+    own = skin.weights[:, b] + skin.weights[:, [name == TOE + side for name in names]].sum(axis=1)
     local = (skin.vertices_m - ankle) @ R
     points, normals = points_about(shape, b, frames, local[own > OWN])
     share = Nearby(skin.vertices_m, skin.faces).mean(own[:, None])
