@@ -7,7 +7,7 @@ from ..foundation.errors import InputError
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
 LARGEST_FRAME = 1_048_574  # either way: Blender's scenes have no others, and would play nothing of them
 MOST_FRAMES, MOST_PER_KEY = 20_000, 100  # from the first frame to the last: so many in any case, and so many for every one that has values
-MOST_POSES = 1_000_000  # of bones in all these frames, in any case
+MOST_POSES = 2_000_000  # of bones in all these frames, in any case
 FARTHEST = 1e9  # in whatever unit: a million kilometres; beyond, squares of numbers overflow in some step
 
 
