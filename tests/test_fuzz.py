@@ -66,6 +66,7 @@ def bomb_png(w: int, h: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
 
 
+@pytest.mark.slow
 def test_bombs_are_refused_before_they_unpack(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(bomb_png(30_000, 30_000))
     (tmp_path / "a.pgm").write_bytes(b"P5 30000 30000 255\n" + b"\0" * 100)

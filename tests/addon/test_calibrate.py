@@ -75,6 +75,7 @@ def test_cameras_that_were_started_one_by_one(blender, empty, bar: Path, tmp_pat
     assert min(places.values()) > 20
 
 
+@pytest.mark.slow
 def test_cameras_at_different_rates(blender, empty, bar: Path, tmp_path: Path) -> None:
     """L takes every second image of the others."""
     for view in "LCR":
@@ -210,6 +211,7 @@ def test_every_sensor_fit_is_read_as_blender_projects(blender, empty, tmp_path: 
     assert read_rig(tmp_path / "out.toml")["mine"].project(point) == pytest.approx([u * width - 0.5, (1 - v) * height - 0.5], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_lens_that_was_cleared_or_cannot_be_read_is_noticed(blender, empty, bar: Path, tmp_path: Path) -> None:
     empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)
     lens = empty.data.movieclips["Bar C"].tracking.camera
@@ -309,6 +311,7 @@ def test_tracks_that_make_no_world_are_told(blender, empty, bar: Path, tmp_path:
         empty.ops.tricap.set_world()
 
 
+@pytest.mark.slow
 def test_undo_takes_calibrated_and_imported_cameras_away(blender, empty, bar: Path, tmp_path: Path) -> None:
     def cameras() -> int:
         return sum(o.type == "CAMERA" for o in empty.context.scene.objects)

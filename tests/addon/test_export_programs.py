@@ -117,7 +117,7 @@ def test_usd_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path, p
     assert np.abs(heads(empty, armature, 6) - source.head_m).max() < PLACE_M
 
 
-@pytest.mark.parametrize(("preset", "unit"), [("plain", 1.0), ("mixamo", 0.01), ("maya", 0.01)])
+@pytest.mark.parametrize(("preset", "unit"), [("plain", 1.0), pytest.param("mixamo", 0.01, marks=pytest.mark.slow), ("maya", 0.01)])
 def test_alembic_comes_back(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str, unit: float) -> None:
     file, source = tmp_path / "a.abc", from_run(small_run.out)
     export_file(small_run.out, "glb", tmp_path / "a.glb", "plain", Monitor())

@@ -62,6 +62,7 @@ def test_a_finished_project_is_opened_beside_the_file(blender: ModuleType, saved
     assert take.read_text().endswith("# mine\n"), "a sample that is there is kept"
 
 
+@pytest.mark.slow
 def test_it_is_computed_again_from_the_beginning(blender: ModuleType, saved: Path, quick: list[list[str]]) -> None:
     assert not blender.ops.tricap.compute_sample.poll()
     blender.ops.tricap.load_sample()

@@ -43,6 +43,7 @@ def fitted_again(folder: Path) -> None:
     write_motion(path, replace(table, values=values), skeleton)
 
 
+@pytest.mark.slow
 def test_things_of_the_user_stay_and_hold_on_to_the_new_body(blender: ModuleType, out: Path) -> None:
     body, scene = built(blender, out), blender.context.scene
     sword, lamp, copy = (blender.data.objects.new(name, None) for name in ("Sword", "Lamp", "Copy"))
@@ -75,6 +76,7 @@ def test_things_of_the_user_stay_and_hold_on_to_the_new_body(blender: ModuleType
     assert "Props" in scene.collection.children and [c.name for c in blender.data.collections].count("Tricap") == 1
 
 
+@pytest.mark.slow
 def test_edits_of_the_motion_are_kept_and_said(blender: ModuleType, out: Path, capfd: pytest.CaptureFixture[str]) -> None:
     body = built(blender, out)
     said(capfd)
@@ -97,6 +99,7 @@ def test_edits_of_the_motion_are_kept_and_said(blender: ModuleType, out: Path, c
     assert "“Measured motion”" in said(capfd) and len([a for a in blender.data.actions if a.name.startswith("Measured motion")]) == 2
 
 
+@pytest.mark.slow
 def test_feet_stay_locked(blender: ModuleType, out: Path, capfd: pytest.CaptureFixture[str]) -> None:
     body = built(blender, out)
     assert blender.ops.tricap.lock_feet() == {"FINISHED"}
@@ -111,6 +114,7 @@ def test_feet_stay_locked(blender: ModuleType, out: Path, capfd: pytest.CaptureF
     assert "The feet" not in said(capfd)
 
 
+@pytest.mark.slow
 def test_a_control_rig_plays_the_new_motion_with_its_corrections(
     blender: ModuleType, out: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -160,6 +160,7 @@ def test_the_metaballs_surface_is_the_fitted_one(empty: ModuleType, balls: str) 
         assert np.abs(distance).max() < SURFACE_MAX_M
 
 
+@pytest.mark.slow
 def test_at_the_joints_of_a_whole_body_the_metaballs_are_the_families_surface(empty: ModuleType) -> None:
     """Elbows bent by 100° and knees by 80°. Measured 0.11 mm RMS, at most 0.39 mm."""
     from tricap.addon.scene import metaballs

@@ -73,6 +73,7 @@ def test_the_views_of_a_written_file_look_at_the_person(empty: ModuleType, out: 
     assert views and all((view.view_location - pelvis).length < 0.3 and 3 < view.view_distance < 6 for view in views)
 
 
+@pytest.mark.slow
 def test_another_floor_leaves_the_motion_in_the_world(empty: ModuleType, out: Path) -> None:
     from tricap.addon.scene import standing
     from tricap.addon.scene.build import build_scene
@@ -90,6 +91,7 @@ def test_another_floor_leaves_the_motion_in_the_world(empty: ModuleType, out: Pa
     np.testing.assert_allclose(placed(empty, body, names), before, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_the_scene_is_tidy_and_a_render_shows_the_body(empty: ModuleType, out: Path) -> None:
     from tricap.addon.scene.build import build_scene
 

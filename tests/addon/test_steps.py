@@ -205,6 +205,7 @@ def test_a_fit_that_asks_for_a_click_has_a_button_for_it(
     assert "tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
 
 
+@pytest.mark.slow
 def test_where_the_fit_finds_nobody_the_panel_asks_for_clicks(
     blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, layout: Any, tmp_path: Path
 ) -> None:

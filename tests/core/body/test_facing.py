@@ -159,6 +159,7 @@ def _few_points(shape: BodyShape, skin: OneSkin, turn_deg: tuple[float, float, f
     return [replace(p, xyz_m=p.xyz_m[i::24], normals=p.normals[i::24], sigma_m=p.sigma_m[i::24]) for i, p in enumerate(frames)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn_deg", [(25.0, 0.0, 0.0), (20.0, -35.0, 5.0)])
 def test_a_bowed_and_turned_face_is_found_where_the_fit_has_none(person, turn_deg: tuple[float, float, float]) -> None:
     """The search began at one place alone: the head of somebody who looked down became a third too large, its face on the forehead."""
@@ -169,6 +170,7 @@ def test_a_bowed_and_turned_face_is_found_where_the_fit_has_none(person, turn_de
     assert np.abs(place.p[6:]).max() < 0.03 and place.facing is not None
 
 
+@pytest.mark.slow
 def test_a_face_that_is_where_the_fit_has_it_is_not_looked_for(person) -> None:
     shape, skin = person
     assert not registered_head(skin, shape, _few_points(shape, skin, (-24.0, 12.0, 3.0))).found
@@ -192,6 +194,7 @@ def _egg_on_a_neck(shape: BodyShape, skin: OneSkin, rng: np.random.Generator) ->
     return SurfacePoints(motion=rest, xyz_m=xyz @ R.T + head, normals=normals @ R.T, sigma_m=np.full(len(xyz), 1e-3))
 
 
+@pytest.mark.slow
 def test_a_head_is_not_pushed_over_the_neck_where_no_face_shows(person) -> None:
     """No point was left without a vertex then, but the others fitted worse: the head of the demo's person looked aside by 42°."""
     shape, skin = person

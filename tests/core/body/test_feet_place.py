@@ -77,6 +77,7 @@ def off_mm(skin: OneSkin, wanted: np.ndarray, side: str) -> float:
     return float(1e3 * np.abs(np.einsum("nk,nk->n", skin.vertices_m[own] - wanted[near], normals[near])).mean())
 
 
+@pytest.mark.slow
 def test_feet_are_turned_and_scaled_as_measured() -> None:
     shape, skin = person()
     wanted = true_vertices()

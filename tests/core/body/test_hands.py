@@ -90,7 +90,7 @@ def test_a_skin_with_fingers_is_closed_and_no_quad_is_flipped() -> None:
     assert len(fingers) == 30 and all((mesh.weights[:, names().index(name)] > 0.6).sum() > 20 for name in fingers)
 
 
-@pytest.mark.parametrize("bend", [-0.2, 0.0, 3.0])
+@pytest.mark.parametrize("bend", [pytest.param(-0.2, marks=pytest.mark.slow), pytest.param(0.0, marks=pytest.mark.slow), 3.0])
 def test_measured_fingers_are_bent_as_far_in_skin_and_bones(bend: float) -> None:
     """With the same quads, closed, and none flipped; the other hand is relaxed."""
     body = replace(default_shape(read_model("upper_body")), finger_bends={"hand.R": FingerBend(bend, 0.1)})
@@ -116,6 +116,7 @@ def test_left_and_right_hands_are_mirror_images() -> None:
     assert cKDTree(sides[0] * [-1, 1, 1]).query(sides[1])[0].max() < 1e-4
 
 
+@pytest.mark.slow
 def test_wider_hands_have_the_same_topology_and_wider_fingers() -> None:
     shape = default_shape(read_model("upper_body"))
     hands = [name.startswith("hand") for name in (bone.name for bone in shape.skeleton.bones)]

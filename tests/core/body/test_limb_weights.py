@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from tests.core.body.whole_body import whole_body
 from tricap.core.body.model_file import read_model
@@ -75,6 +76,7 @@ def seen_head(higher_m: float, ahead_m: float) -> tuple[SurfacePoints, np.ndarra
     return SurfacePoints(motion=pose, xyz_m=moved, normals=normals[front], sigma_m=np.full(len(moved), 0.001)), head
 
 
+@pytest.mark.slow
 def test_the_head_moves_to_the_measured_face() -> None:
     shape, skin = person()
     seen, head = seen_head(HIGHER_M, AHEAD_M)

@@ -61,6 +61,7 @@ def test_thighs_that_touch_leave_no_fold_between_them() -> None:
     assert np.einsum("nk,nk->n", normals[pairs[:, 0]], normals[pairs[:, 1]]).min() > -0.5
 
 
+@pytest.mark.slow
 def test_a_seam_that_is_hard_to_round_off_leaves_the_others_where_they_are(tmp_path: Path) -> None:
     """Collarbones that reach forwards: at their shoulders it takes many rounds, at the hips one."""
     model = tmp_path / "forward.toml"
@@ -90,6 +91,7 @@ def test_seams_are_on_the_surface_and_the_parts_skin_is_kept_elsewhere() -> None
     assert 0.1 < made.mean() < 0.6 and np.sqrt((off[made] ** 2).mean()) < 0.4e-3 and off[made].max() < 3e-3  # measured 0.34 and 2.2 mm
 
 
+@pytest.mark.slow
 def test_limbs_leave_the_trunk_without_an_edge() -> None:
     """The normal turns by no more than 6° other than beside; it did by 84° in armpits, and with few points by 12 and 15° at the crotch."""
     few = SkinSettings(rays=16, contours=5, cap_contours=2)
@@ -118,6 +120,7 @@ def test_a_jump_is_the_turn_less_that_of_the_edges_beside() -> None:
     assert (upright > 10).sum() == 2  # seen from both its quads
 
 
+@pytest.mark.slow
 def test_hands_are_as_near_to_the_surface_as_the_rest() -> None:
     """Contours go on to the fingers' tips; when those were left to the end's cap, hands were 0.8 mm off, and 20 quads turned over there."""
     shape = person_shape(default_shape(read_model("upper_body")))
@@ -144,6 +147,7 @@ def test_the_throat_above_a_short_neck_is_on_the_surface(monkeypatch: pytest.Mon
     assert rms_of_quads(short, skin, throat) < 0.25e-3  # measured 0.21 mm; 0.32
 
 
+@pytest.mark.slow
 def test_quads_that_are_turned_over_are_mended() -> None:
     """Thighs a third thicker cross each other where the legs begin; a quad whose point is drawn over its opposite side is told."""
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]])

@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from tests.core.body.whole_body import whole_body
 from tricap.core.body.shape import BodyShape
@@ -32,6 +33,7 @@ def sharp(vertices: np.ndarray, faces: np.ndarray, own: np.ndarray) -> int:
     return int((turns(vertices, faces, beyond_edges(faces)[0])[own[faces].all(axis=1)] > LARGEST_TURN).sum())
 
 
+@pytest.mark.slow
 def test_a_ledge_is_eased_where_it_may_be() -> None:
     vertices, faces, thigh = ledge()
     before = sharp(vertices, faces, thigh)
@@ -42,6 +44,7 @@ def test_a_ledge_is_eased_where_it_may_be() -> None:
     assert np.array_equal(eased(vertices, faces, np.zeros(len(vertices), dtype=bool)), vertices)
 
 
+@pytest.mark.slow
 def test_a_mesh_too_coarse_for_its_surface_does_not_shrink() -> None:
     shape, _ = body()
     coarse = one_skin(shape, SkinSettings(contours=8, rays=16, cap_contours=3))

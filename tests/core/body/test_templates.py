@@ -93,6 +93,7 @@ def test_a_foot_has_a_heel_five_toes_on_the_floor_and_an_arch() -> None:
     assert outer - inner > 3
 
 
+@pytest.mark.slow
 def test_a_whole_body_has_a_face_and_toes_and_no_flipped_quad() -> None:
     mesh = skin()
     edges = np.concatenate([mesh.faces[:, [i, (i + 1) % 4]] for i in range(4)])
@@ -110,6 +111,7 @@ def test_a_whole_body_has_a_face_and_toes_and_no_flipped_quad() -> None:
     assert head[bone("head")][1] - face[:, 1].min() > 0.10  # the nose; persons face −Y
 
 
+@pytest.mark.slow
 def test_other_persons_have_the_same_topology_and_their_own_size() -> None:
     shape = default_shape(read_model("full"))
     head = [bone.name for bone in shape.skeleton.bones].index("head")

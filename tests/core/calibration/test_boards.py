@@ -97,12 +97,14 @@ def test_random_rigs_reach_the_bound_and_know_it() -> None:
     assert max(ratios) < 2.0
 
 
+@pytest.mark.slow
 def test_a_third_of_wrong_corners_does_no_harm() -> None:
     held = drawn(4, sigma_px=0.1, gross=0.3)
     done = calibrate_rig(observed(held), Monitor())
     assert error_m(held.cameras, done.rig.cameras) < 2.5 * bound_m(held, 0.1)
 
 
+@pytest.mark.slow
 def test_views_out_of_step_are_found_and_reported() -> None:
     held = drawn(3, sigma_px=0.1)
     late = drawn(3, sigma_px=0.1).xy_px.copy()
@@ -211,6 +213,7 @@ def test_two_cameras_that_disagree_in_a_row_are_never_good() -> None:
     assert done.verdict.light != "green" and "among them all from 0 to 4" in done.verdict.sentence
 
 
+@pytest.mark.slow
 def test_views_that_fit_to_a_hundredth_of_a_pixel_are_synchronised() -> None:
     held = drawn(6, sigma_px=0.002)
     xy = held.xy_px.copy()
@@ -227,6 +230,7 @@ def test_cameras_exchanged_towards_the_end_are_never_good() -> None:
     assert done.verdict.light != "green" and "exchanged" in done.verdict.sentence
 
 
+@pytest.mark.slow
 def test_a_bent_board_is_measured_and_reported() -> None:
     rng = np.random.default_rng(7)
     corners = CHESSBOARD.corners_m.copy()
@@ -237,6 +241,7 @@ def test_a_bent_board_is_measured_and_reported() -> None:
     assert error_m(held.cameras, done.rig.cameras) < 3 * bound_m(held, 0.1)
 
 
+@pytest.mark.slow
 def test_a_board_that_is_stretched_in_print_is_never_good() -> None:
     rng = np.random.default_rng(4)
     held = held_board(random_cameras(rng, "wide"), CHESSBOARD.corners_m * [1.01, 1.0, 1.0], 30, rng, sigma_px=0.1)
@@ -308,6 +313,7 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(tmp_path: Path) -> None:
     assert find_variant([inverted], CHARUCO)[0] == Variant(inverted=True)
 
 
+@pytest.mark.slow
 def test_the_command_calibrates_from_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2])
     filmed(tmp_path / "board", CHARUCO, cameras, 10, inverted=True)
@@ -396,6 +402,7 @@ def test_a_charuco_board_whose_sides_were_exchanged_is_recognised(tmp_path: Path
     assert "but one of 5×4; give 5×4" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_board_whose_squares_were_counted_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = tuple(c.resized((384, 288)) for c in benchmark_cameras()[:2])
     filmed(tmp_path / "board", CHESSBOARD, cameras, 3)

@@ -37,11 +37,13 @@ def drawn(seed: int, positions: int, noise: BarNoise) -> WavedBar:
     return waved_bar(random_cameras(rng, RIG_KINDS[seed % len(RIG_KINDS)]), positions, rng, noise)
 
 
+@pytest.mark.slow
 def test_the_bound_is_reached_on_the_benchmark() -> None:
     ratios = [ratio(waved_bar(benchmark_cameras(), 300, np.random.default_rng(s), BarNoise(sigma_px=0.05)), 0.05) for s in range(3)]
     assert np.median(ratios) < 1.15 and max(ratios) < WORST_RATIO
 
 
+@pytest.mark.slow
 def test_a_simple_lens_gets_the_small_model() -> None:
     small = np.isin(INTERIOR, ("f", "k1"))
     cameras = benchmark_cameras(simple_lens=True)

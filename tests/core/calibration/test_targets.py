@@ -153,6 +153,7 @@ def bar_folder(tmp_path_factory: pytest.TempPathFactory):
     return folder, waved
 
 
+@pytest.mark.slow
 def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
     folder, waved = bar_folder
     out = tmp_path / "rig.toml"

@@ -92,6 +92,7 @@ def test_an_impossible_readout_is_refused(tmp_path: Path, readout: str) -> None:
         read_take(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_global_shutter_is_none(tmp_path: Path) -> None:
     for offset in estimate_offsets(open_take(read_take(rolling_take(tmp_path, {}, {}))), Monitor()):
         assert abs(offset.readout_frames) < 0.02 and not offset.rolls, offset

@@ -222,6 +222,7 @@ def test_the_fault_is_named(checked_with: Callable[[Fault], Checked], fault: Fau
         assert named.certain and named.advice
 
 
+@pytest.mark.slow
 def test_a_sound_recording_passes(arm_recording: Record) -> None:
     assert check_take(arm_recording(), Monitor()).lines()[0].endswith("no problems found.")
 
@@ -296,6 +297,7 @@ def test_what_only_the_rhythm_tells_is_a_finding_from_three_sigmas_on() -> None:
     assert [lag for lag, offset in late.items() if offset.doubtful] == [2.0]
 
 
+@pytest.mark.slow
 def test_a_take_of_one_frame_has_no_motion_to_look_for(arm_recording: Record, tmp_path: Path) -> None:
     take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
     said = take / "take.toml"

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tricap.core.checking.texture import MEDIAN, PATCH_PX, Clothes, _mm_per_px, bound_px
 from tricap.core.foundation.progress import Monitor
@@ -70,6 +71,7 @@ def test_what_counts_as_texture_follows_the_limit_of_matching(arm_recording: Cal
     assert Clothes.of(footage, MatchingSettings(max_sigma_px=0.01)).is_blank
 
 
+@pytest.mark.slow
 def test_check_says_what_to_expect(arm_recording: Callable[..., Path], tmp_path: Path) -> None:
     take = tmp_path / "take"
     take.symlink_to(arm_recording())

@@ -122,6 +122,7 @@ def surrounded(case: tuple[str, str], take: Path, outside: Path, capfd: Capture,
     shutil.rmtree(out)
 
 
+@pytest.mark.slow
 def test_each_name_of_a_result_with_something_else_there(small: Path, outside: Path, capfd: Capture, alarm: Callable[[], Any]) -> None:
     for i, name in enumerate(WRITTEN):
         surrounded((name, list(PUT)[i % len(PUT)]), small, outside, capfd, alarm)

@@ -118,6 +118,7 @@ def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
 
 
+@pytest.mark.slow
 def test_an_arm_explains_the_fingers_of_its_hand_or_a_fist(fit) -> None:
     limb, vector = _arm(fit), _vector(fit)
     state = fit.parameters.state(BEFORE, vector)
@@ -134,6 +135,7 @@ def test_an_arm_explains_the_fingers_of_its_hand_or_a_fist(fit) -> None:
     assert open_hand - closed > 0.5 * fingers > 5 and closed > 0.5 * fist.unexplained(wrist)
 
 
+@pytest.mark.slow
 def test_gains_above_the_least_are_exact_and_the_others_are_not_above_it(fit) -> None:
     limb, vector = _arm(fit), _vector(fit)
     near = fit.seen(4, NOTHING).near(limb, fit.parameters.state(POSES[4], vector))

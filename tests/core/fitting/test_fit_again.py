@@ -118,6 +118,7 @@ def test_what_the_fit_does_not_measure_stays_as_it_was() -> None:
     assert _about_earlier(limits, before) is limits
 
 
+@pytest.mark.slow
 def test_bent_fingers_are_as_uncertain_as_body_toml_says() -> None:
     """Also in the complete model, which keeps the bends of the simplified one."""
     simple = replace(default_shape(read_model("full")), finger_bends={"hand.R": FingerBend(0.3, 0.11)})

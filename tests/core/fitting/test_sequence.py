@@ -54,6 +54,7 @@ def _elbow_errors(scene, fit) -> np.ndarray:
     return np.abs(angle(fit.motion.joints_m) - angle(scene.joints_m))
 
 
+@pytest.mark.slow
 def test_known_body_from_one_sided_noise(make_scene) -> None:
     scenes = [make_scene(seed=seed) for seed in range(12)]
     fits = [_fit(scene) for scene in scenes]

@@ -96,6 +96,7 @@ def _limbs(given: FitInput, pose: np.ndarray, monkeypatch) -> dict[str, LimbPlac
     return {next(iter(limb.doubt)): limb for limb in limb_places(fit, points, found, Monitor())}
 
 
+@pytest.mark.slow
 def test_a_leg_that_was_lost_on_the_way_to_another_frame_is_found_again(monkeypatch) -> None:
     """An adjustment draws it to the other leg's points; where it was found, all of the body explains more."""
     used, pose = {}, _pose(0.0)
@@ -115,6 +116,7 @@ def test_a_leg_that_was_lost_on_the_way_to_another_frame_is_found_again(monkeypa
     assert find._with_legs(fit, points, better, again, Monitor())[0] is better
 
 
+@pytest.mark.slow
 def test_a_forearm_without_evidence_of_its_own_is_not_certain_until_it_is_clicked(monkeypatch) -> None:
     pose = _pose(0.0)
     given = _input(pose, points=6000)
@@ -192,6 +194,7 @@ def _cut(model: str = AUTO_BODY) -> tuple[FitInput, np.ndarray]:
     return FitInput(rig=rig, model=model, clouds=[inside], time_s=np.zeros(1)), pose
 
 
+@pytest.mark.slow
 def test_an_upper_body_is_found_where_the_image_cuts_the_person(quick, monkeypatch) -> None:
     given, pose = _cut()
     found = find_joints(given, SETTINGS, Monitor(), RARE)
@@ -207,6 +210,7 @@ def test_an_upper_body_is_found_where_the_image_cuts_the_person(quick, monkeypat
     assert with_start(replace(given, model="arm.R"), SETTINGS, Monitor()).model == "arm.R"
 
 
+@pytest.mark.slow
 def test_a_click_finds_a_person_whom_other_borders_cut_but_not_instead_of_a_clicked_limb(quick, monkeypatch) -> None:
     """Something that moves at the border of the image counts as the person until somebody says where that is."""
     monkeypatch.setattr(find, "framing", lambda *_: search.Framing.CUT)

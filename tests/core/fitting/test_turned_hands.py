@@ -94,6 +94,7 @@ def test_a_hand_has_five_fingers_and_its_thumb_is_beside_the_palm() -> None:
     assert is_hand("hand.L") and not is_hand("hand") and not is_hand("forearm.L") and not is_hand("handle.R")
 
 
+@pytest.mark.slow
 def test_a_hand_that_was_turned_over_is_turned_back(tracking) -> None:
     over = np.tile(_pose(OVER), (FRAMES, 1))
     limb, vector = _right(tracking.fit), tracking.first.vector

@@ -82,6 +82,7 @@ def test_one_frame_is_a_run(plane_take: Path, tmp_path: Path) -> None:
     assert {path.stem.partition("_")[0] for path in (tmp_path / "out" / "report").glob("*.png")} == {"patches", "surface", "cloud"}
 
 
+@pytest.mark.slow
 def test_restart_measures_anew(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tricap.core.surface import measure
 

@@ -48,6 +48,7 @@ def _outline(scenes: Any, shape: BodyShape, motion: np.ndarray, shift: float = 0
     return max(outlines_of(_mask(scenes, shape, motion)), key=len).astype(np.float64) + (0.0, shift)
 
 
+@pytest.mark.slow
 def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
     person = PERSON, PERSON_MOTION
     outlines = {"C": {0: _outline(scenes, *person), 2: _outline(scenes, *person, 6.0)}}

@@ -66,6 +66,7 @@ def test_a_damaged_checkpoint_of_the_body_is_fitted_anew(take: Path, run_again: 
         path.write_bytes(whole)
 
 
+@pytest.mark.slow
 def test_everything_that_was_fitted_is_read_back(take: Path, tmp_path: Path) -> None:
     body = pipeline.run(take, take.with_name("out"), SETTINGS).body
     assert body is not None

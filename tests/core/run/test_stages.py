@@ -287,6 +287,7 @@ def test_a_fitted_body_is_not_replaced_by_that_of_another_take_or_of_fewer_frame
     assert main.main(["measure", str(another), "--out", str(out), "--frames", "0:2", "--restart", *given]) == 0
 
 
+@pytest.mark.slow
 def test_results_of_another_take_are_kept_without_a_body_too(plane_take: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """By single stages and by a batch whose takes have the same name."""
     out, given = tmp_path / "out" / "t", ["--set", "growing.spacing_px=16", "--set", "frames=[0, 2]"]

@@ -190,6 +190,7 @@ def no_seeds(*args: Any, **kwargs: Any) -> Approximations:
     return Approximations(xy=np.zeros((0, 3, 2)), shape=np.zeros((0, 3, 2, 2)), depth_m=np.zeros(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("views", "off_px"), [("LR", (0, 0)), ("LR", (4, -4)), ("LCR", (-4, 4))])
 def test_one_clicked_seed_is_enough(
     plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, views: str, off_px: tuple[int, int]

@@ -179,6 +179,7 @@ def test_a_reduced_image_gives_fewer_points_as_good_in_full_pixels(large_take: P
     assert read_run(tmp_path / "surface" / "run.json")["stages"]["measure"]["reduction"] == 1
 
 
+@pytest.mark.slow
 def test_images_that_show_nothing_when_they_are_reduced_are_measured_as_they_are(
     large_take: Path, few_points: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +207,7 @@ def test_workers_measure_images_of_the_same_size(large_take: Path, tmp_path: Pat
         assert (tmp_path / "one" / "cache" / "surface" / name).read_bytes() == (tmp_path / "two" / "cache" / "surface" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_checkpoints_of_reduced_images_are_shown_in_full_pixels(large_take: Path, few_points: None, tmp_path: Path) -> None:
     run = _tracked(large_take, tmp_path / "out")
     first, cameras, rows = run.clouds[0], run.footage.rig.cameras, run.footage.take.rows_at(0)

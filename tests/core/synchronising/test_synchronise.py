@@ -132,6 +132,7 @@ def test_sound_then_rays_give_the_start_of_a_view_half_a_frame_late(loose: Path,
     assert abs(footage.delay(2, 4)) == pytest.approx(0.5, abs=0.04)
 
 
+@pytest.mark.slow
 def test_without_sound_the_rays_alone_are_enough_where_somebody_moves(loose: Path) -> None:
     timings = synchronise(read_take(loose), Monitor())
     assert [t.method for t in timings] == ["rays", "reference", "rays"]

@@ -84,6 +84,7 @@ def test_a_point_of_the_cloth_looks_alike_in_all_views_and_at_all_times(take: Pa
     assert 0.95 < slope < 1.15  # L has a gain of 1.06
 
 
+@pytest.mark.slow
 def test_second_field_is_half_a_frame_later(tmp_path: Path) -> None:
     slow, fast = tmp_path / "slow", tmp_path / "fast"
     make_arm_take(slow, ArmTakeSettings(frames=2, width_px=192, interlaced="even", noise=0.0))
@@ -114,6 +115,7 @@ def test_other_people_s_folders_are_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "L" / "0000.png").read_bytes() == b"precious"
 
 
+@pytest.mark.slow
 def test_changes_of_the_user_outlive_a_new_recording(tmp_path: Path) -> None:
     make_arm_take(tmp_path, TINY)
     make_arm_take(tmp_path, TINY)

@@ -133,6 +133,7 @@ def test_a_short_recording_keeps_what_lasts(frames: int) -> None:
     assert 0 not in filtered.source and filtered.reason[0] == TrackStatus.TOO_SHORT
 
 
+@pytest.mark.slow
 def test_a_region_that_encloses_nothing_of_the_image_is_named(plane_take: Path, tmp_path: Path) -> None:
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))
     text = (take / "take.toml").read_text(encoding="utf-8")

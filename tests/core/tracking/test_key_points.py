@@ -85,6 +85,7 @@ def test_black_frames_are_bridged(scenes: Any, missing: tuple[int, ...]) -> None
     assert (ended.status[missing[-1] + 1 :] != TrackStatus.MEASURED).all()
 
 
+@pytest.mark.slow
 def test_an_occluded_point_resumes(scenes: Any) -> None:
     """The point in the middle is occluded for two frames: it resumes under its name in its place, or ends without waiting."""
 

@@ -92,6 +92,7 @@ def test_points_are_followed_in_the_images_in_which_they_were_measured(tmp_path:
     assert len(followed[0]) > max(30, 2 * len(followed[1]))
 
 
+@pytest.mark.slow
 def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
     """Points of one field are found in the other, half a line away: no jitter from field to field."""
     bodies = moving_plane(scenes, 4)
@@ -259,6 +260,7 @@ def test_kinematics_are_exact_for_a_parabola() -> None:
     assert np.allclose(tracks.acceleration_m_s2[1:-1, 0], [-4, 6, 0])
 
 
+@pytest.mark.slow
 def test_a_black_frame_is_bridged(tmp_path: Path, scenes: Any) -> None:
     """One view is black in frame 2: the points resume in frame 3 under the same identity, in the right places."""
     bodies = moving_plane(scenes, 5)
