@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 30"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 31"  # part of the fit's key: raise it when the same input gives another body
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

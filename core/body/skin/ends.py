@@ -148,7 +148,7 @@ class _End:
         t = self.template
         places, shares, faces = [self._places], [self._weights], [first + t.faces]
         uv = [t.uv / t.uv_size]
-        ring, at, own = self._ring, self._local, self._of_ring
+        ring, at, own, u = self._ring, self._local, self._of_ring, np.arange(len(self._ring)) / len(self._ring)
         counts = row_counts(len(ring), t.ring)
         count = first + len(t.vertices)
         for step, n in enumerate(counts, 1):
@@ -170,8 +170,9 @@ class _End:
             shares.append(inner[1])
             count += len(pairs)
             faces.append(numbers[quads])
-            uv.append(_row_uv(quads, len(ring), n, pairs, (step - 1) / len(counts), share, t))
-            ring, at, own = upper, up_at, up_own
+            up_u = t.border_u if step == len(counts) else np.arange(n) / n
+            uv.append(_row_uv(quads, u, up_u, pairs, (step - 1) / len(counts), share, t))
+            ring, at, own, u = upper, up_at, up_own, up_u
         quads = np.concatenate(faces)
         found = np.concatenate(uv)
         if self._left:
@@ -264,10 +265,12 @@ def _around(values: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(((1 - at + low) * values[low % len(values)].T + (at - low) * values[(low + 1) % len(values)].T).T)
 
 
-def _row_uv(quads: np.ndarray, low: int, high: int, pairs: np.ndarray, bottom: float, top: float, template: Template) -> np.ndarray:
-    """Texture coordinates (F, 4, 2) of a row, in the strip below the palm's."""
-    u = np.concatenate([np.arange(low) / low, np.arange(high) / high])
-    v = np.concatenate([np.full(low, bottom), np.full(high, top)])
+def _row_uv(
+    quads: np.ndarray, low: np.ndarray, high: np.ndarray, pairs: np.ndarray, bottom: float, top: float, template: Template
+) -> np.ndarray:
+    """Texture coordinates (F, 4, 2) of a row, in the strip below the palm's, from u (N,) to u (M,), 0…1."""
+    u = np.concatenate([low, high])
+    v = np.concatenate([np.full(len(low), bottom), np.full(len(high), top)])
     rolled = u[pairs]
     rolled = np.where(np.ptp(rolled, axis=1, keepdims=True) > 0.5, rolled + (rolled < 0.5), rolled)
     u, v = np.concatenate([u, rolled @ INNER]), np.concatenate([v, v[pairs] @ INNER])

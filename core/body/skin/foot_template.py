@@ -183,6 +183,7 @@ def foot_template() -> Template:
         uv_size=(float(islands[..., 0].max()), float(islands[..., 1].max())),
         girth=GIRTH,
         ring=RING,
+        border_u=np.arange(RING) / RING,
         own=_own(vertices, rings),
         column=np.arange(len(vertices)) % RING,
     )

@@ -311,6 +311,7 @@ def hand_template(bend: float = RELAXED) -> Template:
         uv_size=size,
         girth=girth,
         ring=RING,
+        border_u=np.arange(RING) / RING,
         own=np.ones(len(places)),
         column=np.arange(len(places)) % RING,
     )

@@ -109,6 +109,7 @@ def _finished(vertices: np.ndarray, rings: np.ndarray, cap: np.ndarray, u: np.nd
         uv_size=(GIRTH + MARGIN + high[0] - low[0], float(max(v[-1], high[1] - low[1]))),
         girth=GIRTH,
         ring=COLUMNS,
+        border_u=u[:-1] / GIRTH,
         own=own,
         column=np.arange(len(vertices)) % COLUMNS,
     )

@@ -19,6 +19,7 @@ class Template:
     uv_size: tuple[float, float]
     girth: float  # width of the island at the border
     ring: int
+    border_u: np.ndarray  # (ring,) where the border's vertices are around the island, 0…1
     own: np.ndarray  # (V,) 0 to 1: to what degree the weights are `weights`; for the rest they are those of the part's last ring
     column: np.ndarray  # (V,) the vertex of the border below a vertex
 

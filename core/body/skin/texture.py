@@ -255,8 +255,9 @@ def _facing(at: np.ndarray) -> np.ndarray:
 def _unhidden(camera: Camera, at: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """The rows (M,) of places `_pictured` so (N, 4) that lie inside the image with nothing of the nearest `depth` (h, w) before them."""
     rows = np.flatnonzero(camera.sees(at[:, :2], EDGE_PX + 1))
-    pixel = np.rint(at[rows, :2]).astype(np.int64)
-    return rows[at[rows, 2] < depth[pixel[:, 1], pixel[:, 0]] + NEARER_M]
+    pixel, z, cosine = np.rint(at[rows, :2]).astype(np.int64), at[rows, 2], at[rows, 3]
+    beside = (EDGE_PX + 1) * z / camera.focal_px * np.sqrt(1 / cosine**2 - 1)  # how much nearer the same surface is at the margin's end
+    return rows[z < depth[pixel[:, 1], pixel[:, 0]] + NEARER_M + beside]
 
 
 def _grey(view: View, at: np.ndarray, depth: np.ndarray) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 A texel at X with normal n gets the colour of a known one, that is nearest to
 
-    X mirrored in x = 0, within 3 cm, with a like normal                                                     (1)
-    X but for how far ahead it is, on the other face, front or back, of the same part, within 3 cm            (2)
+    X mirrored in x = 0, within 3 cm across the surface and d along it, with a like normal                  (1)
+    X but for how far ahead it is, on the other face, front or back, of the same part, within 2 d           (2)
 
-and a smooth difference h that fades over r = 3 cm, so that no edge is left where known colours c end (after Pérez, Gangnet & Blake 2003,
+with d = 5 mm and a texel's width: the nearest at the end of what is known would be drawn out into bands. In (2) the normal counts, too,
+reflected in the direction ahead, a difference of 1 like 2 cm: seen from ahead, all places of a flank are one. To this is added
+a smooth difference h that fades over r = 3 cm, so that no edge is left where known colours c end (after Pérez, Gangnet & Blake 2003,
 Poisson image editing, ACM ToG 22(3)), with Δ the Laplace–Beltrami operator of the skin:
 
     c(X) = c(source of X) + h(X) ,   Δh = h/r² ,   h = c − c(source) at known texels                         (3)
@@ -26,7 +28,9 @@ from .closed_skin import OneSkin
 from .ends import HEAD
 from .surface_operators import factorised, laplacian, vertex_normals
 
-FARTHEST_M = 0.03  # of a source from where it is looked for
+FARTHEST_M = 0.03  # of a source from where it is looked for …
+BESIDE_M = 0.005  # … and a texel's width, along the surface: the nearest at the end of what is known would be repeated again and again
+NORMAL_M = 0.02  # that counts like a difference of 1 between normals, in (2)
 LIKE = 0.3  # cosine between normals that are alike
 FADING_M = 0.03  # r of (3)
 HEADS = 0.5  # weight of the head in what is the head's
@@ -70,12 +74,14 @@ def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray, monitor: Monito
     low, high = colour[seen].min(axis=0), colour[seen].max(axis=0)
     places, normals = texels.at(skin.vertices_m), texels.at(vertex_normals(skin.vertices_m, skin.faces))
     from_ahead = places - np.outer(places @ texels.ahead, texels.ahead)
+    reflected = normals - 2 * np.outer(normals @ texels.ahead, texels.ahead)
     head = texels.at(skin.weights[:, [name == HEAD for name in skin.bone_names]].sum(axis=1)) > HEADS
     face = np.where(head, -1, 2 * skin.part[texels.vertex] + (normals @ texels.ahead > 0))
     of_vertices = _nearest_texels(texels)
-    ways: list[Sources] = [partial(_other_face, from_ahead, face)]
+    beside_m = BESIDE_M + float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    ways: list[Sources] = [partial(_other_face, from_ahead, normals, reflected, face, 2 * beside_m)]
     if not skin.rays:
-        ways.insert(0, partial(_other_side, places, normals))
+        ways.insert(0, partial(_other_side, places, normals, beside_m))
     found, known = colour.copy(), seen.copy()
     for sources in ways:
         rows = np.flatnonzero(known)
@@ -95,25 +101,37 @@ def filled(texels: Texels, colour: np.ndarray, seen: np.ndarray, monitor: Monito
     return found
 
 
-def _other_side(places: np.ndarray, normals: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The sources (M,) of (1), among the texels `known` (K,), of the texels `wanted` (M,); −1: none. `places`, `normals` (N, 3)."""
+def _other_side(places: np.ndarray, normals: np.ndarray, beside_m: float, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The sources (M,) of (1), not farther along the surface, among the texels `known` (K,), of the texels `wanted` (M,); −1: none.
+    `places`, `normals` (N, 3)."""
     flip = np.array([-1.0, 1.0, 1.0])
     source = known[_nearest(places[known], flip * places[wanted])]
     like = np.einsum("nk,nk->n", normals[source], flip * normals[wanted]) > LIKE
-    near = np.linalg.norm(places[source] - flip * places[wanted], axis=1) <= FARTHEST_M
+    apart = places[source] - flip * places[wanted]
+    beside = apart - np.einsum("nk,nk->n", apart, normals[source])[:, None] * normals[source]
+    near = np.linalg.norm(beside, axis=1) <= beside_m
     return np.where(near & like, source, -1)
 
 
-def _other_face(from_ahead: np.ndarray, face: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """As `_other_side`, of (2). `from_ahead` (N, 3): places without how far ahead they are; `face` (N,): twice the number of the part, one
-    more in front; negative: none."""
+def _other_face(
+    from_ahead: np.ndarray,
+    normals: np.ndarray,
+    reflected: np.ndarray,
+    face: np.ndarray,
+    beside_m: float,
+    known: np.ndarray,
+    wanted: np.ndarray,
+) -> np.ndarray:
+    """As `_other_side`, of (2). `from_ahead` (N, 3): places without how far ahead they are; `reflected` (N, 3): normals, reflected in that
+    direction; `face` (N,): twice the number of the part, one more in front; negative: none."""
     found = np.full(len(wanted), -1)
     for own in np.unique(face[wanted]):
-        there, here = known[face[known] == (own ^ 1)], np.flatnonzero(face[wanted] == own)
+        there, here = known[face[known] == (own ^ 1)], wanted[face[wanted] == own]
         if own >= 0 and len(there):
-            source = there[_nearest(from_ahead[there], from_ahead[wanted[here]])]
-            near = np.linalg.norm(from_ahead[source] - from_ahead[wanted[here]], axis=1) <= FARTHEST_M
-            found[here] = np.where(near, source, -1)
+            looked_for = np.hstack([from_ahead[here], NORMAL_M * reflected[here]])
+            source = there[_nearest(np.hstack([from_ahead[there], NORMAL_M * normals[there]]), looked_for)]
+            near = np.linalg.norm(from_ahead[source] - from_ahead[here], axis=1) <= beside_m
+            found[face[wanted] == own] = np.where(near, source, -1)
     return found
 
 

@@ -257,32 +257,41 @@ def _fan(ring: np.ndarray, pole: int | None) -> np.ndarray:
 def face_uv(whole: Welded, ends: Sequence[tuple[float, float]] = ()) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
     """Texture coordinates (F, 4, 2) in the order of the nets' faces, and corner (2,) and size (2,) of islands for `ends`, sizes in metres.
 
-    One island per part and end, packed into the square at one scale. u runs around the bones, v along them; an island is as wide as its
-    part's mean girth and as high as the part is long.
+    One island per part and end, packed into the square at one scale. u runs around the bones, v along them, as the rings' mean distances;
+    an island is as wide as its part's mean girth and as high as the part is long.
     """
     sizes = np.array([*(_girth_and_length(whole, net) for net in whole.nets), *ends])
     gap = MARGIN * np.sqrt(sizes.prod(axis=1).sum())
     corners, side = packed(sizes + gap)
     scale = 1 / (side + gap)
     corners, sizes = (corners + gap) * scale, sizes * scale
-    islands = [_net_uv(net) * size + corner for net, size, corner in zip(whole.nets, sizes, corners)]
+    islands = [_net_uv(whole, net) * size + corner for net, size, corner in zip(whole.nets, sizes, corners)]
     return np.concatenate(islands), list(zip(corners, sizes))[len(islands) :]
 
 
 def _girth_and_length(whole: Welded, net: Net) -> tuple[float, float]:
-    rings = whole.vertices_m[np.maximum(net.rings, 0)]
-    there = (net.rings >= 0)[..., None]
-    along = np.linalg.norm(np.diff(rings, axis=0), axis=2)
-    both = (there[1:] & there[:-1])[..., 0]
-    whole_rings = there[..., 0].all(axis=1)
-    girth = np.linalg.norm(rings - np.roll(rings, 1, axis=1), axis=2).sum(axis=1)[whole_rings].mean()
-    return float(girth), float((along * both).sum(axis=1).sum() / both.sum(axis=1).mean())
+    rings, there = whole.vertices_m[np.maximum(net.rings, 0)], (net.rings >= 0).all(axis=1)
+    girth = np.linalg.norm(rings - np.roll(rings, 1, axis=1), axis=2).sum(axis=1)[there].mean()
+    return float(girth), float(_steps_m(whole, net).sum())
 
 
-def _net_uv(net: Net) -> np.ndarray:
+def _steps_m(whole: Welded, net: Net) -> np.ndarray:
+    """(C + 1,) mean distances from pole to ring, from ring to ring, and from ring to pole; 0 without a pole."""
+    steps = np.zeros(len(net.rings) + 1)
+    for i, (a, b) in enumerate(zip(net.rings, net.rings[1:]), 1):
+        both = (a >= 0) & (b >= 0)
+        steps[i] = np.linalg.norm(whole.vertices_m[a[both]] - whole.vertices_m[b[both]], axis=1).mean()
+    for end, pole in zip((0, -1), net.poles):
+        if pole is not None:
+            ring = net.rings[end][net.rings[end] >= 0]
+            steps[end] = np.linalg.norm(whole.vertices_m[ring] - whole.vertices_m[pole], axis=1).mean()
+    return steps
+
+
+def _net_uv(whole: Welded, net: Net) -> np.ndarray:
     """(F, 4, 2) in 0…1 over the net."""
-    rings, rays = net.rings.shape
-    v = (np.arange(rings) + (net.poles[0] is not None)) / (rings - 1 + sum(pole is not None for pole in net.poles))
+    rays, along = net.rings.shape[1], np.cumsum(_steps_m(whole, net))
+    v = along[:-1] / along[-1]
     i, j = np.nonzero(net.kept)
     sides = np.stack([np.stack([j, j + 1, j + 1, j], axis=1) / rays, v[np.stack([i, i, i + 1, i + 1], axis=1)]], axis=-1)
     k = np.arange(0, rays, 2)

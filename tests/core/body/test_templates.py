@@ -57,6 +57,17 @@ def test_templates_are_open_at_their_border_only(template: Template) -> None:
     assert template.uv.min() >= 0 and (template.uv.max(axis=(0, 1)) <= np.array(template.uv_size) + 1e-9).all()
 
 
+def test_no_seam_is_left_where_a_template_begins() -> None:
+    """Around the neck, the quads below the head's ended at other places of the texture than the head's began: a line of false colours."""
+    edges = dict[tuple[int, int], list[np.ndarray]]()
+    for quad, uv in zip(skin().faces.tolist(), skin().uv):
+        for i, j in zip(range(4), (1, 2, 3, 0)):
+            edges.setdefault((min(quad[i], quad[j]), max(quad[i], quad[j])), []).append(uv[[i, j]] if quad[i] < quad[j] else uv[[j, i]])
+    neck = skin().weights[:, [skin().bone_names.index(name) for name in ("neck", "head")]].sum(axis=1) > 0.3
+    apart = [found for edge, found in edges.items() if neck[list(edge)].all() and np.abs(found[0] - found[1]).max() > 1e-9]
+    assert len(apart) > 50 and not [a for a, b in apart if np.ptp(np.concatenate([a, b])[:, 1]) < 1e-9 and np.abs(a - b).max() < 0.1]
+
+
 def test_a_head_has_the_proportions_of_heads_and_two_equal_sides() -> None:
     v = HEAD_MM * head_template().vertices
     head = v[v[:, 1] > -55]

@@ -16,6 +16,7 @@ from tricap.core.body.skin.surface_operators import vertex_normals
 from tricap.core.body.skin.texture import (
     EDGE_PX,
     MASK,
+    NEARER_M,
     RIM_PX,
     TEXTURE,
     Texture,
@@ -23,6 +24,7 @@ from tricap.core.body.skin.texture import (
     View,
     _facing,
     _pictured,
+    _unhidden,
     nearest_depth,
     write_texture,
 )
@@ -124,6 +126,21 @@ def test_a_nearer_surface_hides_and_an_unknown_place_is_not_trusted() -> None:
     baker.add(motion, [filmed(camera, motion, 1.0)])
     seen = baker.finished().seen.ravel()[baker.texel]
     assert seen.any() and baker._texels.at(sigma)[seen].max() < 0.009
+
+
+def test_a_surface_that_is_seen_aslant_does_not_hide_itself() -> None:
+    """Where a pixel is as large as a quad, its margin reaches places of the same surface that are much nearer: texels were lost in rows."""
+    camera, motion = arm_rig(96).cameras[0], poses()[0]
+    posed = Poser(SHAPE, SKIN.weights).posed(SKIN.vertices_m, motion)
+    at = _pictured(camera, posed, vertex_normals(posed, SKIN.faces))
+    aslant = np.flatnonzero(_facing(at) & (at[:, 3] < 0.5) & camera.sees(at[:, :2], EDGE_PX + 1))
+    depth = nearest_depth(camera, posed, SKIN.faces)
+    pixel = np.rint(at[aslant, :2]).astype(int)
+    margin = at[aslant, 2] - depth[pixel[:, 1], pixel[:, 0]]
+    assert len(aslant) > 20 and (margin > NEARER_M).any(), "no case"
+    assert len(_unhidden(camera, at[aslant], depth)) == len(aslant)
+    hidden = depth - 0.15  # as by an arm before it
+    assert not len(_unhidden(camera, at[aslant], hidden))
 
 
 def test_esc_ends_the_filling_of_a_texture(baked: tuple[TextureBaker, Texture]) -> None:

@@ -10,7 +10,7 @@ from tricap.core.body.skin.closed_skin import one_skin
 from tricap.core.body.skin.mesh import SkinSettings
 from tricap.core.body.skin.surface_operators import vertex_normals
 from tricap.core.body.skin.texture import _texels
-from tricap.core.body.skin.texture_fill import HEADS, PLAIN, Texels, filled
+from tricap.core.body.skin.texture_fill import HEADS, PLAIN, Texels, _other_side, filled
 from tricap.core.foundation.progress import Monitor
 
 AHEAD = np.array([0.0, -1.0, 0.0])
@@ -49,6 +49,28 @@ def test_a_head_has_no_second_face() -> None:
     found = filled(t, paint, ahead > 0, Monitor())
     behind = head & (ahead < -0.7)
     assert behind.sum() > 50 and found[behind].std() < 0.5 * paint[behind].std()
+
+
+def test_the_end_of_what_is_known_is_not_repeated() -> None:
+    """Its last colours were drawn out into bands, 3 cm long."""
+    t = texels()
+    places, normals = t.at(t.skin.vertices_m), t.at(vertex_normals(t.skin.vertices_m, t.skin.faces))
+    low = np.quantile(places[:, 2], 0.4)
+    known = np.flatnonzero((places[:, 0] > 0) & (places[:, 2] < low))
+    within, beyond = (np.flatnonzero((places[:, 0] < -0.05) & (np.abs(places[:, 2] - low - h) < 0.01)) for h in (-0.03, 0.025))
+    assert len(within) > 30 and (_other_side(places, normals, 0.012, known, within) >= 0).mean() > 0.9
+    assert len(beyond) > 30 and (_other_side(places, normals, 0.012, known, beyond) < 0).mean() > 0.9
+
+
+def test_a_flank_has_the_colours_of_like_normals_and_no_bands() -> None:
+    """From the front, all places of a flank are at the same place."""
+    t = texels()
+    ahead = t.at(vertex_normals(t.skin.vertices_m, t.skin.faces)) @ AHEAD
+    head = t.at(t.skin.weights[:, t.skin.bone_names.index("head")]) > HEADS
+    paint = np.repeat(120 + 100 * np.abs(ahead)[:, None], 3, axis=1)
+    found = filled(t, paint, ahead > 0.0, Monitor())[:, 0]
+    flank = ~head & (ahead < -0.3) & (ahead > -0.8)
+    assert np.median(np.abs(found - paint[:, 0])[flank]) < 8
 
 
 def test_where_the_surroundings_differ_no_edge_is_left() -> None:
