@@ -9,6 +9,7 @@ is always in metres. Axes: FBX and USD use those of the program, glTF and Alembi
 import errno
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -152,6 +153,7 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     try:
         store.try_writing(part)
         _check_free(part.parent, LEAST_FREE_MB)
+        _check_largest(LEAST_FREE_MB)
         with unheard() if bpy.app.background else nullcontext():
             export(str(part))
         _check_free(part.parent, LEFT_MB)
@@ -171,6 +173,16 @@ def _check_free(folder: Path, megabytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < megabytes << 20:
         raise OSError(errno.ENOSPC, f"{free >> 10} kB are left on the disk, {megabytes} MB are needed")
+
+
+def _check_largest(megabytes: int) -> None:
+    """A limit of the size of files (`ulimit -f`) ends Alembic and Blender with it."""
+    if sys.platform != "win32":
+        import resource
+
+        largest = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+        if largest != resource.RLIM_INFINITY and largest < megabytes << 20:
+            raise OSError(errno.EFBIG, f"no file may be larger than {largest >> 10} kB here, and {megabytes} MB are needed")
 
 
 def _fbx(path: str, program: Program) -> None:

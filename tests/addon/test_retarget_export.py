@@ -283,6 +283,23 @@ def test_a_full_disk_is_noticed_before_and_after(empty: ModuleType, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
+def test_a_limit_of_the_size_of_files_is_noticed_before(empty: ModuleType, tmp_path: Path) -> None:
+    """Alembic ended the process, and left a part of the file."""
+    import resource
+
+    from tricap.addon.retarget import by_blender
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, before[1]))
+    try:
+        with pytest.raises(InputError, match="no file may be larger than 1024 kB here, and 32 MB are needed"):
+            by_blender.write_whole(tmp_path / "a.abc", lambda part: pytest.fail("the exporter was called"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has /dev/full")
 def test_exporters_do_not_print_into_full_streams(empty: ModuleType, tmp_path: Path) -> None:
     from tricap.addon.retarget.by_blender import write_whole

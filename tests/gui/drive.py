@@ -85,6 +85,16 @@ def wait_for(condition: Callable[[], object], seconds: float, what: str) -> Step
     say("ok    ", f"{what} ({time.monotonic() - began:.2f} s)")
 
 
+def quiet(seconds: float = 4.0) -> Steps:
+    """Until nothing has run for some seconds: a check may begin by itself (every two it is looked for one), and moves the buttons."""
+    since = time.monotonic()
+    while time.monotonic() - since < seconds:
+        if bpy.context.window_manager.tricap.running:
+            since = time.monotonic()
+        yield
+    yield from settle()
+
+
 def settle(pauses: int = 4) -> Steps:
     """Let everything be laid out and drawn."""
     for area in window().screen.areas:

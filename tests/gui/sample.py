@@ -26,6 +26,7 @@ def steps() -> drive.Steps:
     yield from drive.wait_for(lambda: state.running and state.progress > 0, 20, "a job runs and tells how far it is")
     yield from drive.shot("3_running")
     yield from stopped_by_esc(area)
+    yield from drive.quiet()
     began = time.monotonic()
     yield from drive.press(area, "tricap.compute_sample")
     drive.check(state.running, "the job was started again")
