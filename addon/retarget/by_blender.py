@@ -153,11 +153,13 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     try:
         store.try_writing(part)
         _check_free(part.parent, LEAST_FREE_MB)
-        _check_largest(LEAST_FREE_MB)
+        _check_largest(LEAST_FREE_MB << 20)
         with unheard() if bpy.app.background else nullcontext():
             export(str(part))
         _check_free(part.parent, LEFT_MB)
-        if not part.is_file():
+        if part.is_file():
+            _check_largest(part.stat().st_size + 1)  # USD ends as if all were well, with a part of the file
+        else:
             raise InputError(f"Blender wrote nothing to {file}; choose another folder.")
         os.replace(part, file)
     except (OSError, RuntimeError, shutil.Error) as error:
@@ -175,14 +177,14 @@ def _check_free(folder: Path, megabytes: int) -> None:
         raise OSError(errno.ENOSPC, f"{free >> 10} kB are left on the disk, {megabytes} MB are needed")
 
 
-def _check_largest(megabytes: int) -> None:
-    """A limit of the size of files (`ulimit -f`) ends Alembic and Blender with it."""
+def _check_largest(size: int) -> None:
+    """A limit of the size of files (`ulimit -f`) ends Alembic and Blender with it, and cuts USD."""
     if sys.platform != "win32":
         import resource
 
         largest = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-        if largest != resource.RLIM_INFINITY and largest < megabytes << 20:
-            raise OSError(errno.EFBIG, f"no file may be larger than {largest >> 10} kB here, and {megabytes} MB are needed")
+        if largest != resource.RLIM_INFINITY and largest < size:
+            raise OSError(errno.EFBIG, f"no file may be larger than {largest >> 10} kB here, and {-(-size >> 20)} MB are needed")
 
 
 def _fbx(path: str, program: Program) -> None:

@@ -295,6 +295,9 @@ def test_a_limit_of_the_size_of_files_is_noticed_before(empty: ModuleType, tmp_p
     try:
         with pytest.raises(InputError, match="no file may be larger than 1024 kB here, and 32 MB are needed"):
             by_blender.write_whole(tmp_path / "a.abc", lambda part: pytest.fail("the exporter was called"))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (33 << 20, before[1]))
+        with pytest.raises(InputError, match="no file may be larger than 33792 kB here"):
+            by_blender.write_whole(tmp_path / "a.usdc", lambda part: (Path(part).touch(), os.truncate(part, 33 << 20)))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
